@@ -35,9 +35,8 @@ class Watch:
 
     def __init__(self):
         self.records, self.at, self.synced, self.sizes = [], [], [], []
-        # estimated time of all solves of each record, in s: mean time × number of
-        # solves. Before repeated solves (`inner_loops` > 1), there is one more solve,
-        # which is not part of the mean.
+        # estimated time of all solves of each record, in s: mean time of the timed
+        # solves × number of all solves
         self.solving = []
         self._fsync, self._fsync_seconds = os.fsync, 0.0
         os.fsync = self._timed_fsync
@@ -59,7 +58,7 @@ class Watch:
     def advance(self, record):
         self.records.append((record.solver, record.repeat, record.total_seconds))
         self.solving.append(
-            record.total_seconds * (record.inner_loops + (record.inner_loops > 1))
+            record.total_seconds * (record.inner_loops + record.untimed_loops)
         )
         self.at.append(perf_counter())
         self.synced.append(self._fsync_seconds)

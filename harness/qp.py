@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array, csc_array, csr_array, issparse, tril, triu
+from scipy.sparse import coo_array, csc_array, issparse, tril, triu
 
 from mortarbench.harness.errors import InputError, shortened, shown
 from mortarbench.harness.sets.blocks import Blocks
@@ -21,7 +21,7 @@ from mortarbench.harness.sets.discs import Discs
 #: parts of a QP that are passed to `QP.from_arrays`, except sets
 _PARTS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 NEEDS_MATRICES = "needs explicit matrices"
-Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
+Matrix = Any  #: (r, c) ndarray, csc_array, or (P only) LinearOperator
 #: Largest absolute entry of P − Pᵀ that counts as rounding, relative to the largest
 #: absolute entry of P.
 SYMMETRY_TOLERANCE = 1e-12
@@ -65,10 +65,11 @@ class QP:
     Blocks of variables may also be restricted to convex sets; z_box is then an element
     of the normal cone of the set at x.
 
-    Absent constraints have zero rows, and absent bounds are ±inf, never None. Vectors
-    and the entries of matrices become read-only, so that an exception occurs if a
-    solver scales its input in place. `from_arrays` accepts more types of input and
-    copies the arrays.
+    Absent constraints have zero rows, and absent bounds are ±inf, never None. Sparse
+    matrices of any format become ``scipy.sparse.csc_array``, without duplicate entries
+    and with 32-bit indices if these suffice. Vectors and the entries of matrices become
+    read-only, so that an exception occurs if a solver scales its input in place.
+    `from_arrays` accepts more types of input and copies the arrays.
 
     Parameters
     ----------
@@ -130,6 +131,7 @@ class QP:
         assert isinstance(box, Box)
         if lb is not None or ub is not None:
             box = Box(box.lower if lb is None else lb, box.upper if ub is None else ub)
+        P, A, G = map(_by_columns, (P, A, G))
         arrays = {"P": P, "q": q, "A": A, "b": b, "G": G, "h": h}
         n, m, p = q.size, b.size, h.size
         shapes = ((n, n), (n,), (m, n), (m,), (p, n), (p,))
@@ -337,16 +339,6 @@ class QP:
         """Return a copy of the QP with the given bounds (n,)."""
         return replace(self, sets=(Box(lb, ub), *self.sets[1:]))
 
-    def with_matrices(self, convert: Callable[[Matrix], Matrix]) -> QP:
-        """Return a copy of the QP with sparse matrices in another storage format.
-
-        convert : maps a sparse matrix to an equal matrix in that format; not applied to
-            dense matrices and operators
-        """
-        matrices = {name: getattr(self, name) for name in ("P", "A", "G")}
-        sparse = {name: convert(M) for name, M in matrices.items() if issparse(M)}
-        return replace(self, **sparse)
-
     def objective(self, x: Vector) -> float:
         """Evaluate ½ xᵀP x + qᵀx."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x)
@@ -411,7 +403,7 @@ def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:
 
 def no_rows(n: int) -> Matrix:
     """Return a sparse (0, n) matrix, which stands for absent constraints."""
-    return csr_array((0, n))
+    return csc_array((0, n))
 
 
 def needs_matrices(qp: QP) -> str | None:
@@ -645,6 +637,17 @@ def _rows(
             f"{side} has {vector.size} entries; expected {p}, one per row of {name}"
         )
     return matrix, vector
+
+
+def _by_columns(M: Matrix) -> Matrix:
+    """Return a sparse matrix as a `csc_array`, see `QP`; return others unchanged."""
+    if not issparse(M):
+        return M
+    M = canonical(M if isinstance(M, csc_array) else csc_array(M))
+    if M.indices.dtype != np.int32 and max(M.nnz, *M.shape) < 2**31:
+        narrow = (M.indices.astype(np.int32), M.indptr.astype(np.int32))
+        M = csc_array((M.data, *narrow), shape=M.shape)
+    return M
 
 
 def _freeze(M: Matrix) -> None:

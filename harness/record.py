@@ -110,9 +110,15 @@ class Measurement:
     peak_mib: float | None = None  #: peak resident memory of the worker
     prepare_peak_mib: float | None = None
     solve_peak_mib: float | None = None
-    #: number of solves timed together, if a single solve is too short; times are means
-    #: over these solves
+    #: number of timed solves; times are means over these solves
     inner_loops: int = 1
+    #: number of untimed solves before and between the timed ones; 0 if the first solve
+    #: is timed, as for solves of more than a second and for steps of a sequence
+    untimed_loops: int = 0
+    #: True if the solver reuses answers of earlier solves, so that its times are not
+    #: those of a solve; None if no QP with another objective was solved for comparison,
+    #: see `harness.verify.measure`
+    remembered: bool | None = None
 
 
 MEASURED = tuple(f.name for f in fields(Measurement))
@@ -309,7 +315,12 @@ class Record(Measurement):
 
 
 #: journal names of attributes whose journal name differs from the attribute name
-_JOURNAL_NAMES = {"verdict": "status", "inner_loops": "inner", "role": "arm"}
+_JOURNAL_NAMES = {
+    "verdict": "status",
+    "inner_loops": "inner",
+    "untimed_loops": "untimed",
+    "role": "arm",
+}
 
 
 def in_space(quantities: Mapping[str, Any]) -> bool:

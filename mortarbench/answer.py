@@ -25,7 +25,16 @@ from mortarbench.arguments import (
     tolerance,
 )
 from mortarbench.case import Case, as_case, build_case
-from mortarbench.harness import QP, Fields, Record, Residuals, Solution, Solver, Verdict
+from mortarbench.harness import (
+    QP,
+    Fields,
+    Record,
+    Residuals,
+    Solution,
+    Solver,
+    Verdict,
+    checked,
+)
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError
@@ -69,6 +78,7 @@ MAX_CERTIFIED_ERROR = 0.01
 #: not in contact. Interior-point methods return forces of about 1e-8 at open contacts;
 #: forces at closed contacts are far larger.
 MAX_OPEN_FORCE = 1e-6
+TIME_LIMIT = 300.0  #: default time limit of `solve`, in s
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -395,6 +405,7 @@ def solve(
     options: Mapping[str, Any] | None = None,
     plugins: Plugins = (),
     ranks: int = 1,
+    time_limit: float = TIME_LIMIT,
     **more: Any,
 ) -> Answer:
     """Run one solver on one case in a separate process, and verify its answer.
@@ -413,6 +424,7 @@ def solve(
         option ``history`` records its iterations unless ``history = False`` is passed
     plugins : Python files with more solvers or families
     ranks : number of MPI processes that jointly solve the case
+    time_limit : limit for the solve, in s
     more : further options of the solver, as keyword arguments
 
     Raises
@@ -438,7 +450,14 @@ def solve(
     check_solver(solver)
     problem = as_case(case, plugins)
     ranks_asked(ranks, "ranks")
-    with solver_session(solver, problem.registries, options, ranks=ranks) as answer:
+    session = solver_session(
+        solver,
+        problem.registries,
+        options,
+        ranks=ranks,
+        time_limit=checked.positive("time_limit", time_limit),
+    )
+    with session as answer:
         return answer(problem, tol)
 
 
@@ -450,10 +469,11 @@ def solver_session(
     *,
     forks: bool = False,
     ranks: int = 1,
+    time_limit: float = TIME_LIMIT,
 ) -> Iterator[Callable[[Case, float], Answer]]:
     """Start a solver process; yield a function that solves a case to a tolerance.
 
-    solver, options, ranks : see `solve`
+    solver, options, ranks, time_limit : see `solve`
     registries : registries that contain the solver; the process loads the same plug-ins
     forks : True to allow a fork of this process as the solver process where a fork is
         safe; see `harness.processes.forking`
@@ -502,6 +522,7 @@ def solver_session(
                 record,
                 registries.reference,
                 source=source,
+                time_limit=time_limit,
             )
         return Answer(
             case=case,

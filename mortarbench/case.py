@@ -8,11 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from scipy.sparse import csc_array, csc_matrix
-
 from mortarbench.arguments import EXPORTS, check_output_file
-from mortarbench.harness import QP, Fields, Matrix, Solution, plugin
+from mortarbench.harness import QP, Fields, Solution, plugin
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.names import CaseId, parse, unbuilt
 from mortarbench.harness.verify.verdicts import plain
@@ -66,12 +63,11 @@ class Case(plugin.Case):
     def qp(self) -> QP:
         """Non-dimensional QP; its energy in SI units is scale · objective + constant.
 
-        The matrices have types that other libraries accept: ``scipy.sparse``
-        ``csc_matrix``, with 32-bit indices if these suffice, or dense arrays. P may
-        also be an operator, as for a decomposed problem; its matrix is
-        ``P @ numpy.eye(n)``.
+        The matrices have the types that solvers receive in a run: ``scipy.sparse``
+        ``csc_array`` with 32-bit indices if these suffice, or dense arrays. P may also
+        be an operator, as for a decomposed problem; its matrix is ``P @ numpy.eye(n)``.
         """
-        return self.family_case.qp.with_matrices(_exported)
+        return self.family_case.qp
 
     @property
     def scale(self) -> float:
@@ -197,16 +193,6 @@ class Case(plugin.Case):
         return f"<Case {self.name}: {sizes}>"
 
 
-def _exported(M: Matrix) -> Matrix:
-    """Return a sparse matrix as a `csc_matrix`, with 32-bit indices if they suffice."""
-    M = csc_matrix(M)
-    if max(M.nnz, *M.shape) < 2**31:
-        narrow = (M.indices.astype(np.int32), M.indptr.astype(np.int32))
-        M = csc_matrix((M.data, *narrow), shape=M.shape)
-    M.sum_duplicates()
-    return M
-
-
 class BareQP(plugin.Family):
     """Family of a single problem: a QP that was passed as an object."""
 
@@ -253,9 +239,7 @@ def as_case(problem: Case | QP | str | object, plugins: Plugins = ()) -> Case:
                 extended.__dict__["family_case"] = problem.family_case
             return extended
         case QP():
-            # mortarbench expects sparse arrays, for which `*` is elementwise; for
-            # sparse matrices, `*` is the matrix product.
-            family = BareQP(problem.with_matrices(csc_array))
+            family = BareQP(problem)
             name = CaseId(family=family, name="qp", params={}, form="qp")
             return Case(id=name, registries=load_registries(plugins))
         case str():

@@ -12,16 +12,19 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from html import escape as html_escape
+from threading import Event as Signal
+from threading import Thread
 from time import monotonic
 from typing import Any, TextIO
 
-from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import InputError, say
 from mortarbench.harness.errors import shown as repeated
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.running.progress import Progress
 
 _REASON_LENGTH = 120  #: maximum displayed length of the reason for declining a QP
 _BAR_WIDTH = 60  #: smallest width of a terminal, in columns, at which a bar is shown
+WAIT_SECONDS = 10.0  #: time between two lines of `waiting`
 _UPDATE_SECONDS = 0.2  #: shortest time between two updates of a bar in a notebook
 
 
@@ -307,3 +310,24 @@ def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
 
 def ignore(text: str) -> None:
     """Discard a message."""
+
+
+@contextmanager
+def waiting() -> Iterator[Callable[[str], None]]:
+    """Print a line on stderr every `WAIT_SECONDS`, with the current activity.
+
+    Yields a function that sets the activity.
+    """
+    began, now, ended = monotonic(), [""], Signal()
+
+    def tick() -> None:
+        while not ended.wait(WAIT_SECONDS):
+            say(f"{now[0]} ({monotonic() - began:.0f} s since the start)")
+
+    thread = Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield lambda text: now.__setitem__(0, text)
+    finally:
+        ended.set()
+        thread.join()

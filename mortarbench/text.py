@@ -172,6 +172,8 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
     )
     per = "" if in_space(r.quantities) else "/m"
     units = _units(per) if "dofs" in r.quantities else {}
+    several = r.inner_loops > 1
+    timed = f"s (mean of {r.inner_loops} runs)" if several else "s (one run)"
     rows = [
         ("case", r.case),
         ("size", ", ".join(f"{count} {what}" for what, count in r.sizes.items())),
@@ -186,8 +188,8 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
             (f"ranks, {name}", f"{mean:.3g} s (largest {largest:.3g})")
             for name, (mean, largest) in r.rank_seconds.items()
         ),
-        ("prepare", _text(r.prepare_seconds, "s (one run)", digits=3)),
-        ("solve", _text(r.solve_seconds, "s (one run)", digits=3)),
+        ("prepare", _text(r.prepare_seconds, timed, digits=3)),
+        ("solve", _text(r.solve_seconds, timed, digits=3)),
         ("peak memory", _text(r.peak_mib, "MiB", digits=4)),
         *(
             (f"{name} residual", _text(_none_if_nan(getattr(r, name)), digits=2))

@@ -42,7 +42,7 @@ from mortarbench.text import align, printable
 
 #: solver with which the answers of the other solvers are compared
 COMPARED_WITH = "smalbe"
-TIME_LIMIT = 60.0  #: time limit for each check of the conformance suite, in s
+TIME_LIMIT = 10.0  #: time limit for each check of the conformance suite, in s
 MEMORY_LIMIT = 4096.0  #: memory limit for each check, in MiB
 #: largest number of entries in a list on the terminal; the page lists all entries
 _MAX_ENTRIES = 12
@@ -328,18 +328,23 @@ def test_solver(
     *,
     plugins: Plugins = (),  # noqa: PT028  # not a test
     checks: Iterable[str] | None = None,  # noqa: PT028
+    time_limit: float = TIME_LIMIT,  # noqa: PT028
+    progress: Callable[[str], None] = ignore,  # noqa: PT028
     registries: Registries | None = None,  # noqa: PT028
 ) -> Conformance:
     """Run the conformance suite on a solver, in a separate process.
 
-    If the process ends or hangs during a check, the check fails or, for a reformulated
-    QP, counts as a weakness; the remaining checks are run in a new process.
+    If the process ends or exceeds the time limit during a check, the check fails or,
+    for a reformulated QP, counts as a weakness; the remaining checks are run in a new
+    process.
 
     Parameters
     ----------
     solver : a name listed by `solvers`, or an object as for `mortarbench.solve`
     plugins : Python files with more solvers
     checks : names of the checks to run; None for all
+    time_limit : limit for each check, in s
+    progress : called before each check with its number and name
     registries : used instead of built-in registries, installed plug-ins and `plugins`
 
     Raises
@@ -355,6 +360,8 @@ def test_solver(
 
     """
     check_solver(solver)
+    checked.positive("time_limit", time_limit)
+    checked.function("progress", progress)
     registries = load_registries(plugins) if registries is None else registries
     names = list(conformance.CHECKS if checks is None else checks)
     for check in names:
@@ -372,17 +379,20 @@ def test_solver(
         command = registries.worker_command(spec, copy)
         worker = WorkerProcess(command, scratch / "worker.log")
         stack.callback(worker.close)
-        results = {check: _run_check(worker, check) for check in names}
+        results = {}
+        for number, check in enumerate(names, start=1):
+            progress(f"{name}: check {number} of {len(names)}, {check}")
+            results[check] = _run_check(worker, check, time_limit)
     return Conformance(solver=name, results=results)
 
 
-def _run_check(worker: WorkerProcess, check: str) -> Result:
+def _run_check(worker: WorkerProcess, check: str, time_limit: float) -> Result:
     """Run one check; without a reply of the solver's process, return a failure.
 
     For a check of an equivalent formulation, a weakness is returned instead.
     """
     reply = worker.ask(
-        {"check": check}, time_limit=TIME_LIMIT, memory_limit=MEMORY_LIMIT
+        {"check": check}, time_limit=time_limit, memory_limit=MEMORY_LIMIT
     )
     if reply.answer is None:
         is_weakness = check.startswith(INVARIANCE_PREFIX)

@@ -73,7 +73,7 @@ def pytest_xdist_make_scheduler(
 def pytest_configure(config: pytest.Config) -> None:
     """Share the CPUs among pytest-xdist's workers.
 
-    The harness binds measured processes to the last CPU that it may use. Without
+    The harness binds measured processes to the fastest CPU that it may use. Without
     separate CPUs, all workers would measure on the same CPU.
     """
     os.environ.update(ONE_THREAD)  # as the command line does

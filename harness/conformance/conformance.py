@@ -1,10 +1,11 @@
 """Checks of the contract of solvers, run by ``mortarbench test-solver``.
 
 The name of each check is a statement about the solver. A check passes, or it fails with
-a description of the violation. If the solver declines the QP, the check counts as
-declined, and the result contains the reason that the solver states. If the answer
-changes under an equivalent formulation of the QP, the check reports a weakness. Such a
-change is not a failure, since many otherwise correct solvers would fail.
+a description of the violation, which may be an exception. If the solver declines the
+QP, the check counts as declined, and the result contains the reason that the solver
+states. If the answer changes under an equivalent formulation of the QP, the check
+reports a weakness. Such a change is not a failure, since many otherwise correct solvers
+would fail.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ import numpy as np
 from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness.conformance.equivalence import (
-    DeclinedError,
     WeaknessError,
     changes_of,
     same_answer,
@@ -46,10 +46,11 @@ from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
 from mortarbench.harness.verify.infeasibility import certificate_of
 from mortarbench.harness.verify.kkt import diagnosis, kkt_residuals
 from mortarbench.harness.verify.measure import (
-    ReasonError,
-    failure,
-    measure,
-    reason_to_decline,
+    REMEMBERED_SPEEDUP,
+    DeclinedError,
+    Prepare,
+    SolverError,
+    solve_once,
 )
 
 #: beginning of the names of checks that compare the answer with a planted solution
@@ -60,6 +61,8 @@ SETS_PREFIX = "solves over"
 DEGENERATE = f"{SETS_PREFIX} the degenerate cone"
 #: tolerances of the check `DEGENERATE`
 DEGENERATE_TOLERANCES = (1e-6, 1e-8)
+#: beginning of the names of checks that solve one QP twice, with others between
+MEMORY_PREFIX = "remembers no answer"
 #: beginning of the names of checks that compare equivalent formulations
 INVARIANCE_PREFIX = "keeps its answer"
 #: advice for solvers that need the entries of P
@@ -74,6 +77,12 @@ GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest permitted difference in x between repeats. The order of summation, and hence
 #: rounding, may depend on the alignment of arrays in memory.
 REPEAT_ROUNDING = 1e-12
+#: Number of variables of the QPs of the check of remembered answers. Solvers take
+#: milliseconds, so that a cache saves more than `MIN_GAIN_SECONDS`.
+TIMED_VARIABLES = 300
+MIN_GAIN_SECONDS = 1e-3  #: smallest gain in time that counts as remembering, s
+#: Number of experiments that must all show the gain. Other programs may delay a few.
+EXPERIMENTS = 3
 
 
 class Grade(StrEnum):
@@ -110,7 +119,7 @@ def run_check(name: str, solver: Solver) -> Result:
     """Run the check with this name in `CHECKS`, and return its result."""
     try:
         return CHECKS[name](solver) or Result(Grade.PASS)
-    except ContractError as e:
+    except (ContractError, SolverError) as e:
         return Result(Grade.FAIL, str(e))
     except DeclinedError as e:
         return Result(Grade.DECLINE, str(e))
@@ -120,24 +129,9 @@ def run_check(name: str, solver: Solver) -> Result:
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
     """Solve as in a measurement; raise if the solver declines or fails without x."""
-    s = _end(solver, qp, tol)
+    s, _ = solve_once(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
         raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
-    return s
-
-
-def _end(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve as in a measurement, which converts an exception of the solver to a status.
-
-    Raises
-    ------
-    DeclinedError
-        If the solver declines the QP.
-
-    """
-    s = measure(solver, qp, tol).solution
-    if s.status is Status.DECLINED:
-        raise DeclinedError(s.message)
     return s
 
 
@@ -262,7 +256,7 @@ def _a_misspelt_option_is_refused(solver: Solver) -> None:
 
 def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> Result:
     qp = problem()
-    s = _end(solver, qp, 1e-9)
+    s, _ = solve_once(solver, qp, 1e-9)
     if s.status is Status.SOLVED:
         raise ContractError("claims to have solved a QP without a solution")
     if not s.message:
@@ -313,25 +307,55 @@ def _runs_in_one_thread(solver: Solver) -> None:
 
 def _a_sequence_is_solved(solver: Solver) -> None:
     """Require correct solutions of the QPs of `_sequence`, solved as a sequence."""
+    prepare = _chained(solver)
+    for i, qp in enumerate(_sequence()):
+        try:
+            s, _ = solve_once(solver, qp, 1e-6, prepare)
+            _judge(qp, s, VERIFIED_FACTOR * 1e-6)
+        except (ContractError, SolverError) as e:
+            raise ContractError(f"QP {i + 1} of the sequence: {e}") from None
+
+
+def _chained(solver: Solver) -> Prepare:
+    """Begin a sequence; raise DeclinedError if the solver has no sequences."""
     chain = getattr(solver, "chain", None)
     if chain is None:
         raise DeclinedError("has no chain()")
-    qps = _sequence()
-    prepare = chain(1e-6)
-    for i, qp in enumerate(qps):
-        try:
-            if (reason := reason_to_decline(solver, qp)) is not None:
-                raise DeclinedError(reason)
-            _judge(qp, prepare(qp)(), VERIFIED_FACTOR * 1e-6)
-        except (ContractError, ReasonError) as e:
-            raise ContractError(f"QP {i + 1} of the sequence: {e}") from None
-        except DeclinedError:
-            raise
-        except ImportError as e:
-            raise DeclinedError(f"not installed: {e.name}") from None
-        except Exception as e:  # raised by code of the solver
-            message = f"QP {i + 1} of the sequence: {failure(solver, e)}"
-            raise ContractError(message) from None
+    prepare: Prepare = chain(1e-6)
+    return prepare
+
+
+def _remembers_no_answer(shape: str, solver: Solver, *, chained: bool = False) -> None:
+    """Solve the QPs A, B, A and B', which have the same shape and different numbers.
+
+    A is the same object in both solves. Its first solve may be slow, for instance
+    because code is compiled, and is not compared. A factor of a sparsity pattern may be
+    reused, since it also accelerates the solves of B and B'.
+
+    chained : True to solve each QP as the first one of a new sequence
+    """
+    for seed in range(0, 3 * EXPERIMENTS, 3):
+        a, b, other = (
+            manufactured(shape, seed=seed + k, n=TIMED_VARIABLES)[0] for k in range(3)
+        )
+        seconds, earlier = list[float](), list[tuple[QP, Solution]]()
+        for qp in (a, b, a, other):
+            prepare = _chained(solver) if chained else None
+            s, total = solve_once(solver, qp, 1e-6, prepare)
+            if any(p is not qp and np.array_equal(t.x, s.x) for p, t in earlier):
+                raise ContractError(
+                    "returned the answer of another QP of the same shape"
+                )
+            _judge(qp, s, VERIFIED_FACTOR * 1e-6)
+            seconds.append(total)
+            earlier.append((qp, s))
+        again, least = seconds[2], min(seconds[1], seconds[3])
+        if least < max(REMEMBERED_SPEEDUP * again, again + MIN_GAIN_SECONDS):
+            return
+    raise ContractError(
+        f"the second solve of a QP took {again:.2g} s, solves of other QPs of the same "
+        f"shape took {least:.2g} s or more; expected no results of earlier solves"
+    )
 
 
 def _sequence() -> list[QP]:
@@ -389,6 +413,12 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
     yield "gives multipliers our signs", _multipliers_have_our_signs
     yield "puts none on absent bounds", _absent_bounds_have_no_multipliers
     yield "starts every repeat cold, same answer", _repeats_are_cold_and_alike
+    for shape in ("bounds", "equalities"):
+        yield f"{MEMORY_PREFIX}: {shape}", partial(_remembers_no_answer, shape)
+        yield (
+            f"{MEMORY_PREFIX}: {shape}, sequences",
+            partial(_remembers_no_answer, shape, chained=True),
+        )
     for dense in (False, True):
         name = f"leaves the problem alone: {'dense' if dense else 'sparse'}"
         yield name, partial(_the_problem_is_left_alone, dense)

@@ -33,7 +33,7 @@ from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR, Verdict
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import kkt_residuals, verdict
-from mortarbench.harness.verify.measure import measure
+from mortarbench.harness.verify.measure import DeclinedError, solve_once
 
 TOL = 1e-8  #: tolerance of all solves of the strings
 #: Largest permitted difference, relative to the energies. The factor of 10 accounts for
@@ -54,10 +54,6 @@ class WeaknessError(Exception):
     """Error for a verdict or answer that changes under an equivalent formulation."""
 
 
-class DeclinedError(Exception):
-    """Error for a QP that a solver declines; the message is the solver's reason."""
-
-
 def same_answer(
     form: str, change: str, solver: Solver, old: Solution | None = None
 ) -> tuple[int | None, int | None]:
@@ -75,6 +71,8 @@ def same_answer(
     DeclinedError
         If the solver declines one of the QPs, or, for a change other than `UNCHANGED`,
         if its answer to the unchanged QP is not verified.
+    SolverError
+        If the solver raises an exception.
     WeaknessError
         If the answer to the changed QP is not verified, or differs from the answer to
         the unchanged QP.
@@ -99,10 +97,7 @@ def same_answer(
 
 def answer(solver: Solver, qp: QP) -> Solution:
     """Solve a QP at the tolerance `TOL`; raise DeclinedError if it is declined."""
-    s = measure(solver, qp, TOL).solution
-    if s.status is Status.DECLINED:
-        raise DeclinedError(s.message)
-    return s
+    return solve_once(solver, qp, TOL)[0]
 
 
 def _fault(qp: QP, s: Solution) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array, eye_array, kron
+from scipy.sparse import csc_array, diags_array, eye_array, kron
 
 from mortarbench.harness.qp import QP, Matrix, Structure, Vector, no_rows
 from mortarbench.harness.sets.cones import Cones
@@ -48,7 +48,7 @@ def manufactured(
     >>> bool(np.allclose(qp.P @ point.x + qp.q + qp.A.T @ point.y, 0))
     True
     """
-    store: Callable[[Matrix], Matrix] = np.asarray if dense else csr_array
+    store: Callable[[Matrix], Matrix] = np.asarray if dense else csc_array
     return _plant(np.random.default_rng(seed), n, store, SHAPES[shape])
 
 
@@ -147,11 +147,11 @@ def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solut
     z = np.where(np.arange(rows) == 0, 0.7, 0.0)
     P = M @ M.T / n + 0.1 * np.eye(n)
     qp = QP(
-        P=csr_array(P),
+        P=csc_array(P),
         q=-(P @ x + A.T @ y + G.T @ z + z_box),
-        A=csr_array(A),
+        A=csc_array(A),
         b=A @ x,
-        G=csr_array(G),
+        G=csc_array(G),
         h=G @ x + (z == 0),
         lb=lb,
         ub=np.full(n, np.inf),
@@ -171,7 +171,7 @@ def degenerate_cone() -> tuple[QP, Vector]:
     complementarity.
     """
     qp = QP(
-        P=csr_array(np.eye(3)),
+        P=csc_array(np.eye(3)),
         q=np.array([-4.0, -4.0, 0.0]),
         A=no_rows(3),
         b=np.zeros(0),
@@ -191,11 +191,11 @@ def one_of_each() -> tuple[QP, dict[str, Vector]]:
     """
     inf = np.inf
     qp = QP(
-        P=csr_array(np.eye(4)),
+        P=csc_array(np.eye(4)),
         q=np.array([-3.0, 4.0, -5.0, -9.0]),
-        A=csr_array([[0.0, 0, 0, 2]]),
+        A=csc_array([[0.0, 0, 0, 2]]),
         b=np.array([2.0]),
-        G=csr_array([[0.0, 0, 2, 0]]),
+        G=csc_array([[0.0, 0, 2, 0]]),
         h=np.array([2.0]),
         lb=np.array([-inf, -1, -inf, -inf]),
         ub=np.array([1, inf, inf, inf]),
@@ -217,7 +217,7 @@ def membrane(k: int) -> QP:
     x, y = np.meshgrid(*2 * [np.arange(1, k + 1) / (k + 1)])
     n = k * k
     return QP(
-        P=csr_array(kron(second, eye) + kron(eye, second)),
+        P=csc_array(kron(second, eye) + kron(eye, second)),
         q=np.full(n, 8 / (k + 1) ** 2),
         A=no_rows(n),
         b=np.zeros(0),
@@ -256,11 +256,11 @@ def strings(form: str) -> QP:
     A, no_box = np.eye(42)[ends], np.full(42, np.inf)
     if form == "primal":
         return QP(
-            P=csr_array(K),
+            P=csc_array(K),
             q=-f,
-            A=csr_array(A),
+            A=csc_array(A),
             b=np.zeros(4),
-            G=csr_array(G),
+            G=csc_array(G),
             h=h,
             lb=-no_box,
             ub=no_box,
@@ -283,7 +283,7 @@ def strings(form: str) -> QP:
         h=np.zeros(0),
         lb=np.where(np.arange(m) < m - h.size, -np.inf, 0),
         ub=np.full(m, np.inf),
-        structure=Structure(K=csr_array(K), B=csr_array(B), fixed=fixed),
+        structure=Structure(K=csc_array(K), B=csc_array(B), fixed=fixed),
     )
 
 
@@ -308,11 +308,11 @@ def infeasible() -> QP:
     """Return a QP with the contradictory rows x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
     rows = np.eye(2, 20) - np.eye(2, 20)[::-1]
     return QP(
-        P=csr_array(np.eye(20)),
+        P=csc_array(np.eye(20)),
         q=np.ones(20),
         A=no_rows(20),
         b=np.zeros(0),
-        G=csr_array(rows),
+        G=csc_array(rows),
         h=-np.ones(2),
         lb=np.full(20, -np.inf),
         ub=np.full(20, np.inf),
@@ -322,7 +322,7 @@ def infeasible() -> QP:
 def unbounded() -> QP:
     """Return a QP that decreases linearly in x₀, a variable without upper bound."""
     return QP(
-        P=csr_array(np.diag([0.0] + [1.0] * 19)),
+        P=csc_array(np.diag([0.0] + [1.0] * 19)),
         q=-np.ones(20),
         A=no_rows(20),
         b=np.zeros(0),

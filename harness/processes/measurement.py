@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -34,6 +34,7 @@ from mortarbench.harness.record import (
 )
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import Residuals
+from mortarbench.harness.verify.measure import REMEMBERED_SPEEDUP
 from mortarbench.harness.verify.verdicts import (
     certified,
     has_point,
@@ -45,19 +46,14 @@ from mortarbench.harness.verify.verdicts import (
 #: Largest CPU time that the harness may use between the events "start" and "timed"
 #: while the worker's clock is stopped.
 HARNESS_SECONDS = 0.005
-#: Largest further CPU time of the harness per repeat of the solve. On a busy machine,
-#: 0.12 ms were measured; the margin prevents false suspicion of a solver.
-HARNESS_SECONDS_PER_REPEAT = 3e-4
-#: A repeat is suspected of reusing results if the time of the repeat, multiplied by
-#: this factor, is less than the time of the first solve. The difference of the times
-#: must also exceed `MIN_GAIN_SECONDS` or `MIN_GAIN_BETWEEN_SECONDS`, because ratios of
-#: tiny times are unreliable.
-MIN_SUSPICIOUS_SPEEDUP = 20.0
-#: smallest suspicious difference between the times of solves in one measurement, s
-MIN_GAIN_SECONDS = 1e-3
-#: smallest suspicious difference between the times of the first solves of two
-#: measurements, s
-MIN_GAIN_BETWEEN_SECONDS = 5e-3
+#: Largest further CPU time of the harness per solve. On a busy machine, 0.12 ms were
+#: measured; the margin prevents false suspicion of a solver.
+HARNESS_SECONDS_PER_SOLVE = 3e-4
+
+REMEMBERED_NOTE = (
+    "the solver reuses answers of earlier solves: for a QP with another objective it "
+    f"takes more than {REMEMBERED_SPEEDUP:g} times as long, or returns the same point"
+)
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
@@ -89,7 +85,9 @@ def measure_and_judge(
     whole : returns the entire QP. If ranks emit the QP and evaluate the answer, `whole`
         is called only for values that the ranks cannot evaluate
     request : request to the worker, see `harness.processes.worker`; the tolerance and
-        the memory limit are added. The worker writes the point to the file ``out``
+        the memory limit are added. The worker writes the point to the file ``out``. If
+        the worker ends in a repetition of a completed solve, the QP is solved and timed
+        once in a new worker
     time_limit, memory_limit : limits in s and MiB
 
     Raises
@@ -107,7 +105,11 @@ def measure_and_judge(
     out = Path(request["out"])
     try:
         out.unlink(missing_ok=True)
-        reply = worker.ask(request, time_limit=time_limit, memory_limit=memory_limit)
+        ask = partial(worker.ask, time_limit=time_limit, memory_limit=memory_limit)
+        reply, notes = ask(request), list[str]()
+        if reply.in_repeats:
+            notes = [f"solved only once, since a repeated solve ended: {reply.message}"]
+            reply = ask({**request, "once": True})
         if reply.fault:
             raise FaultError(f"{record.solver} on {record.case}: {reply.message}")
         record = record.replace(
@@ -138,7 +140,8 @@ def measure_and_judge(
     except OSError as e:
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
-    record, *notes = _with_cost(reply, record, worker.first_seconds)
+    record, *more = _with_cost(reply, record)
+    notes += more
     sizes, by_ranks = record.sizes, source_of(request) is Source.RANKS
     is_pointless = by_ranks and not has_point(solution)
     evaluation = reply.answer["evaluated"] if by_ranks else None
@@ -170,24 +173,17 @@ def _as_tuples(data: Any) -> Any:
     return tuple(data) if isinstance(data, list) else data
 
 
-def _with_cost(
-    reply: Reply, record: Record, first_seconds: dict[Hashable, float]
-) -> tuple[Record, *tuple[str, ...]]:
-    """Add the cost of a measurement to its record; return the record with any notes.
-
-    first_seconds : see `_caching_notes`
-    """
+def _with_cost(reply: Reply, record: Record) -> tuple[Record, *tuple[str, ...]]:
+    """Add the cost of a measurement to its record; return the record with any notes."""
     assert reply.answer is not None
     cost, *notes = _plausible_cost(reply)
+    notes += [REMEMBERED_NOTE] * bool(cost.remembered)
     if (
         record.ranks > 1
         # rank 0 measures only its own memory, the parent measures the memory of all
         # ranks
     ):
         cost = replace(cost, peak_mib=reply.peak_mib)
-    if not notes:
-        first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)
-        notes = _caching_notes(cost, first, first_seconds, key)
     return record.replace(**asdict(cost)), *notes
 
 
@@ -219,7 +215,7 @@ def sizes_from_ranks(
 def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     """Return the worker's times if plausible, else the parent's time with a note.
 
-    The sum T of the worker's times must satisfy
+    The sum T of the worker's times over all solves must satisfy
 
         CPU time − harness overhead ≤ T ≤ wall time,
 
@@ -231,10 +227,8 @@ def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     cost = Measurement(**{name: answer[journal_name(name)] for name in MEASURED})
     if clock is None or cost.total_seconds is None:
         return (cost,)
-    inner, first = cost.inner_loops, answer["first_seconds"]
-    solves = inner + (first is not None)
-    reported = (first or 0.0) + inner * cost.total_seconds
-    least = clock.min_seconds - HARNESS_SECONDS - inner * HARNESS_SECONDS_PER_REPEAT
+    solves, reported = answer["solves"], answer["worked_seconds"]
+    least = clock.min_seconds - HARNESS_SECONDS - solves * HARNESS_SECONDS_PER_SOLVE
     if max(0.0, least) <= reported <= clock.max_seconds:
         return (cost,)
     mean = clock.elapsed_seconds / solves
@@ -246,37 +240,6 @@ def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
         f"{clock.min_seconds:.3g} s of CPU time and was done after "
         f"{clock.elapsed_seconds:.3g} s; the parent's time is recorded"
     )
-
-
-def _caching_notes(
-    m: Measurement,
-    first: float | None,
-    first_seconds: dict[Hashable, float],
-    key: Hashable,
-) -> list[str]:
-    """Return notes on repeats that were much faster than the first solve.
-
-    m : cost of this measurement
-    first : time of the first of several solves in this measurement, in s; None if there
-        was only one solve
-    first_seconds : time of the first solve by this worker, in s, by QP and tolerance;
-        an entry for `key` is added if it is missing
-    key : QP and tolerance of this measurement
-    """
-    if m.total_seconds is None:
-        return []
-    first = first or m.total_seconds
-    before = first_seconds.setdefault(key, first)
-    compared = [
-        (first, m.total_seconds, MIN_GAIN_SECONDS, "solves"),
-        (before, first, MIN_GAIN_BETWEEN_SECONDS, "measurements"),
-    ]
-    return [
-        f"the first solve took {slow:.3g} s and a later one {fast:.3g} s: results are "
-        f"cached between {these}, or something was loaded in the first solve"
-        for slow, fast, gain, these in compared
-        if slow > MIN_SUSPICIOUS_SPEEDUP * fast and slow - fast > gain
-    ]
 
 
 def _check_memory(limit: float, record: Record) -> Record:
@@ -324,14 +287,16 @@ def measure_once(
     reference: Reference,
     *,
     source: Source = Source.FILE,
+    time_limit: float = inf,
 ) -> tuple[Record, Solution | None]:
-    """Measure once without limits, judge the answer, compute quantities and bounds.
+    """Measure once, judge the answer, and compute quantities and bounds.
 
     case : returns the case; the first call builds it
     reference : reference solver, called if the residuals alone do not decide the
         verdict
     source : origin of the QP. For `Source.RANKS`, the ranks judge their answer
         themselves, and the case is built only for values that the ranks cannot evaluate
+    time_limit : limit of the solve, in s
 
     Raises
     ------
@@ -356,7 +321,7 @@ def measure_once(
             lambda: case().qp,
             record,
             request,
-            time_limit=inf,
+            time_limit=time_limit,
             memory_limit=inf,
         )
         try:

@@ -7,7 +7,8 @@ more events. The worker ends when the pipe of requests is closed.
 * ``{"warm_up": true}`` requests untimed preparations; reply: ``{"event": "warm"}``.
 * Every other request is answered by ``{"event": "start"}``, at which the parent starts
   its clock, and by ``{"event": "done", …}`` with the answer. In a measurement, the
-  worker sends ``{"event": "timed"}`` between these two events, when its own clock has
+  worker sends ``{"event": "solved"}`` between these two events after the first solve,
+  and ``{"event": "timed"}`` after the last one, when its own clock has
   stopped. The worker then waits for a line from the parent, so that the parent can read
   the worker's CPU time. If MPI ranks emit the QP of a case, rank 0 sends ``{"event":
   "emitted", …}`` before "start". After "timed", and before the ranks evaluate the
@@ -43,6 +44,7 @@ class Events:
     """Callbacks with which the handler of a request sends events to the parent."""
 
     start: Callable[[], None]  #: sends "start", at which the parent starts its clock
+    solved: Callable[[], None]  #: sends "solved": the first solve has ended
     #: sends "timed": the worker's clock has stopped. Returns after the parent has read
     #: the CPU time
     timed: Callable[[], None]
@@ -94,7 +96,12 @@ def _events(requests: TextIO, replies: TextIO) -> Events:
     def reached(event: str, entries: Mapping[str, Any]) -> None:
         _send(replies, event=event, **entries)
 
-    return Events(lambda: _send(replies, event="start"), timed, reached)
+    return Events(
+        lambda: _send(replies, event="start"),
+        lambda: _send(replies, event="solved"),
+        timed,
+        reached,
+    )
 
 
 def _send(replies: TextIO, **event: Any) -> None:

@@ -52,6 +52,7 @@ from mortarbench.harness.distributed.vectors import (
     Ranks,
     Share,
 )
+from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.operators import Maker, SerialisableOperator
@@ -215,7 +216,7 @@ def this_rank() -> Ranks:
     """
     from mpi4py import MPI  # imported here, because only runs on ranks need it
 
-    cpus = sorted(os.sched_getaffinity(0))
+    cpus = fastest_first(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
     if RECORD in os.environ:
         os.set_inheritable(int(os.environ[RECORD]), False)

@@ -24,7 +24,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
@@ -34,6 +34,7 @@ from typing import Any, ClassVar
 from weakref import WeakSet
 
 from mortarbench.harness import limits
+from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.processes import reaper
 from mortarbench.harness.processes.footprint import Footprint
@@ -52,6 +53,9 @@ from mortarbench.harness.verify.measure import one_line
 POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
 START_SECONDS = 120.0  #: time limit for starting a worker, and for loading a QP
 WARM_UP_SECONDS = 60.0  #: time limit of the warm-up
+#: time limit of all solves after the first one, which took at most
+#: `harness.verify.measure.MAX_UNTIMED_SECONDS`
+REPEAT_SECONDS = 30.0
 POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
 #: longest time between the closing of the pipe of requests and the exit of a worker,
 #: after which the worker is killed
@@ -113,6 +117,8 @@ class Reply:
     verdict: Verdict | None = None
     fault: bool = False  #: True if the harness or the machine failed, not the solver
     message: str = ""  #: description of the failure, and notes
+    #: True if the worker ended in a solve that repeats a completed solve
+    in_repeats: bool = False
     peak_mib: float | None = None  #: largest memory that the parent observed
     #: the parent's times of a measurement; None for other requests
     clock: Clock | None = None
@@ -127,7 +133,7 @@ class WorkerProcess:
     """Worker process, started by the first request and replaced after it has died.
 
     Two file descriptors, for requests and for replies, are appended to `command`. The
-    worker runs in its own session, on the last CPU that this process may use.
+    worker runs in its own session, on the fastest CPU that this process may use.
     Environment variables set the thread pools of common libraries to one thread.
     The output of the worker goes to the file `log`.
 
@@ -135,14 +141,9 @@ class WorkerProcess:
     until the previous one is answered. Forks of this process own none of its workers.
     """
 
-    #: times of first solves in s, by keys that the caller chooses; not used in this
-    #: class
-    first_seconds: dict[Hashable, float]
-
     _all: ClassVar[WeakSet[WorkerProcess]] = WeakSet()
 
     def __init__(self, command: list[str], log: Path) -> None:
-        self.first_seconds = {}
         self._command = command
         self._log = log
         self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
@@ -198,7 +199,7 @@ class WorkerProcess:
         memory_limit : limit for all processes of the worker together, in MiB
         """
         self._peak_mib, self._emitted = 0.0, None
-        cpu = max(os.sched_getaffinity(0))
+        cpu = fastest_first(os.sched_getaffinity(0))[0]
         # Stop other workers before this worker resumes, since two workers must never
         # run on one CPU.
         for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
@@ -280,7 +281,8 @@ class WorkerProcess:
         try:
             clock = None
             if measures(request):
-                self._await("timed", time_limit, memory_limit)
+                self._await("solved", time_limit, memory_limit)
+                self._await("timed", REPEAT_SECONDS, memory_limit)
                 ended = time.monotonic()
                 clock = Clock(
                     min_seconds=min(self._cpu_seconds() - used, ended - started),
@@ -331,6 +333,7 @@ class WorkerProcess:
             verdict=None if is_fault else verdict,
             fault=is_fault,
             message=message,
+            in_repeats=end.event == "timed",
             peak_mib=peak,
             emitted=self._emitted,
             **self._facts,
@@ -361,8 +364,7 @@ class WorkerProcess:
 
     def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
         """Start a fork that calls `serve`, or the command if `serve` is None."""
-        usable = os.sched_getaffinity(0)
-        self._cpu = max(usable)
+        self._cpu = fastest_first(os.sched_getaffinity(0))[0]
         self._footprint = Footprint()
         self._unread = bytearray()
         their_requests, self._requests = _pipe()
@@ -711,7 +713,9 @@ class _WorkerEndError(Exception):
     def __init__(
         self, event: str, verdict: Verdict, how: str, number: int = 0, *, stage: str
     ) -> None:
-        self.is_early = event not in ("emitted", "timed", "measured", "done")
+        self.event = event
+        during = ("emitted", "solved", "timed", "measured", "done")
+        self.is_early = event not in during
         super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
         if self.is_early and verdict is Verdict.TIME_LIMIT:
             # the limit `START_SECONDS` has expired, not the limit of the suite

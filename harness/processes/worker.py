@@ -10,7 +10,7 @@ answers three kinds of requests:
   - ``digest``: digest of the file, which is checked; without a digest, QPs with an
     operator are refused,
   - ``memory_limit``: limit in MiB,
-  - ``sample_seconds``: see `harness.verify.measure`,
+  - ``once``: true for a single solve, which is timed,
   - ``step``: index 0, 1, … of the QP in a sequence, and
   - ``tightens``: true if each step of the sequence has its own tolerance
 
@@ -61,7 +61,14 @@ from mortarbench.harness.processes.ranks import ParallelSolver, RankCosts, follo
 from mortarbench.harness.qp import QP, Vector, no_rows
 from mortarbench.harness.record import finite, journal_name
 from mortarbench.harness.solution import Solution, Status
-from mortarbench.harness.verify.measure import Prepare, Timed, measure, memory_mib
+from mortarbench.harness.verify.measure import (
+    DeclinedError,
+    Prepare,
+    SolverError,
+    measure,
+    memory_mib,
+    solve_once,
+)
 
 #: Largest number of doubles (2 MiB) in the array that shifts addresses between
 #: measurements. The pages of the array are never touched and take no memory.
@@ -132,7 +139,8 @@ class _SolverHost:
         no_row = dict(A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0))
         one_row_each = dict(A=ones, b=np.ones(1), G=one, h=np.ones(1))
         for rows in (no_row, one_row_each):
-            _measure_in_process(self._solver, QP(P=P, **pull, **rows), 1e-6)
+            with suppress(DeclinedError, SolverError):
+                solve_once(self._solver, QP(P=P, **pull, **rows), 1e-6)
         canary_seconds()
         gc.freeze()  # exclude the loaded modules from collections during measurements
         return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
@@ -168,13 +176,15 @@ class _SolverHost:
             qp = self._load(request)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
-        timed = _measure_in_process(
+        timed = measure(
             self.parallel or self._solver,
             qp,
             request["tol"],
             prepare=self._step(request),
-            sample_seconds=request.get("sample_seconds", 0.0),
+            once=request.get("once", False),
+            perturbs=self.parallel is None,  # ranks assemble their shares of the QP
             starts=events.start,
+            solved=events.solved,
             ends=events.timed,
         )
         _limit_memory(None)
@@ -193,7 +203,8 @@ class _SolverHost:
             "iterations": s.iterations,
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
-            "first_seconds": timed.first_seconds,
+            "worked_seconds": timed.worked_seconds,
+            "solves": timed.solves,
             # fields that the parent copies to the record unchanged
             "record": {"canary_seconds": canary, **spent.fields()},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
@@ -310,29 +321,3 @@ def _limit_memory(mib: float | None) -> None:
         if hard != resource.RLIM_INFINITY:
             soft = min(soft, hard)
     resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-
-
-def _measure_in_process(
-    solver: Solver,
-    qp: QP,
-    tol: float,
-    *,
-    ends: Callable[[], None] = lambda: None,
-    **how: Any,
-) -> Timed:
-    """Measure in this process; end forked children that return from the solver.
-
-    If a solver forks and the child returns from the call, the child would answer the
-    request a second time.
-
-    ends : called when the worker's clock has stopped
-    how : further arguments of `harness.verify.measure.measure`
-    """
-    process = os.getpid()
-
-    def ends_here() -> None:
-        if os.getpid() != process:
-            os._exit(0)
-        ends()
-
-    return measure(solver, qp, tol, ends=ends_here, **how)

@@ -24,6 +24,7 @@ from weakref import WeakValueDictionary, finalize
 from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
+from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.environment.environment import capture_in, digest
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.limits import ONE_THREAD
@@ -235,7 +236,7 @@ def claim_cpu(stack: ExitStack) -> int:
         If all CPUs are taken, or the folder of the locks is not safe to use.
 
     """
-    usable = sorted(os.sched_getaffinity(os.getpid()), reverse=True)
+    usable = fastest_first(os.sched_getaffinity(os.getpid()))
     with _lock_folder() as folder:
         for cpu in usable:
             flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW

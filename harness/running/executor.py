@@ -32,10 +32,8 @@ from mortarbench.harness.results.work_unit import (
     WorkUnit,
 )
 from mortarbench.harness.solution import Solution
-from mortarbench.harness.verify.measure import SAMPLE_SECONDS
 from mortarbench.harness.verify.verdicts import has_point, noted
 
-_MAX_STORED_OPTIMA = 1000  #: largest number of small QPs whose optima are cached
 #: largest tolerance of a step, which applies far from the fixed point
 MAX_STEP_TOL = 1e-2
 
@@ -191,7 +189,6 @@ class Executor:
         request = {
             "out": str(self._point),
             "source": source,
-            "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
             **({"step": step} if block.is_sequence else {}),
             **({"tightens": True} if record.tighten else {}),
         }

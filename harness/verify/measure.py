@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from inspect import unwrap
-from math import ceil
+from itertools import count
 from numbers import Real
 from pathlib import Path
 from time import perf_counter
@@ -22,15 +23,27 @@ from scipy.sparse import issparse
 from mortarbench.harness.errors import shortened, shown
 from mortarbench.harness.limits import too_large
 from mortarbench.harness.operators import SerialisableOperator, assembled
-from mortarbench.harness.plugin import Solver
+from mortarbench.harness.plugin import About, Solver
 from mortarbench.harness.qp import NEEDS_MATRICES, QP, Vector
 from mortarbench.harness.record import Measurement
 from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")
-SAMPLE_SECONDS = 0.005  #: approximate total time of all repetitions (s); see `measure`
-MAX_INNER_LOOPS = 100  #: largest number of repetitions of a short solve
+SAMPLE_SECONDS = 0.005  #: smallest total time of the timed solves, s; see `measure`
+#: Largest number of timed solves. It ends the repetition if the clock stands still.
+MAX_INNER_LOOPS = 500
+#: A first solve that takes longer, in s, is not repeated: it is the timed solve.
+MAX_UNTIMED_SECONDS = 1.0
+#: A solver reuses answers if its solves of a QP are more than this factor faster than
+#: its solves of perturbed QPs. The work on two QPs that differ by 1 % rarely differs
+#: by more than 2.
+REMEMBERED_SPEEDUP = 5.0
+#: Number of perturbed solves that must all be slower. Other programs may delay a few.
+MIN_PERTURBED_SOLVES = 3
+#: Total time of perturbed solves, s, after which the timed solves follow each other. It
+#: is exceeded only if perturbed solves are slower than the timed ones.
+MAX_PERTURBED_SECONDS = 2 * SAMPLE_SECONDS
 #: Largest number of rows of an operator P that is assembled for a solver.
 MAX_ASSEMBLED_ROWS = 3000
 #: largest count that is stored, since doubles do not represent all larger integers
@@ -39,6 +52,8 @@ MAX_MESSAGE = 1900  #: largest length of a message of a solver, in characters
 _MAX_NAME = 60  #: largest length of a file name in a message, in characters
 
 _VECTORS = ("x", "y", "z", "z_box")
+_GOLDEN_RATIO = 0.6180339887498949
+_perturbations = count(1)  # numbers of the perturbations in this process
 
 
 class Timed(NamedTuple):
@@ -46,11 +61,15 @@ class Timed(NamedTuple):
 
     solution: Solution  #: solution, whose vectors are float arrays of the right shapes
     cost: Measurement  #: times and memory
-    #: time of the first solve in s; None if the solve was not repeated
-    first_seconds: float | None = None
+    worked_seconds: float = 0.0  #: total time of all solves, also of untimed ones, s
+    solves: int = 0  #: number of all solves
 
 
 Prepare = Callable[[QP], Callable[[], Solution]]
+
+
+def _nothing() -> None:
+    """Do nothing."""
 
 
 def measure(
@@ -59,88 +78,276 @@ def measure(
     tol: float,
     *,
     prepare: Prepare | None = None,
-    sample_seconds: float = 0.0,
-    starts: Callable[[], None] = lambda: None,
-    ends: Callable[[], None] = lambda: None,
+    once: bool = False,
+    perturbs: bool = True,
+    starts: Callable[[], None] = _nothing,
+    solved: Callable[[], None] = _nothing,
+    ends: Callable[[], None] = _nothing,
 ) -> Timed:
     """Time the preparation and the solution of `qp` by `solver`.
 
+    The first solve is not timed, because it may include compilation and loading. Then
+    `qp` is solved until the timed solves together take `SAMPLE_SECONDS`, at least once.
+    Each timed solve follows an untimed solve of a QP with another objective
+    (`perturbed`), which overwrites results that the solver keeps. The recorded times
+    are means over the timed solves, and the recorded answer is the last one. If the
+    first solve takes more than `MAX_UNTIMED_SECONDS`, it is the only solve, and it is
+    timed.
+
+    The solver reuses answers (`Measurement.remembered`) if it returns the same point
+    for both QPs, or if each solve of a perturbed QP takes more than
+    `REMEMBERED_SPEEDUP` times as long as the fastest timed solve.
+
     Errors of the solver are not raised. After an exception, a missing library or a
     malformed answer, the result is a solution without a point that has a status and a
-    message. The call of `declines` counts as preparation. If the solver cannot use an
-    operator P (`harness.needs_matrices`) and P has at most MAX_ASSEMBLED_ROWS rows, P
-    is assembled, which also counts as preparation.
+    message. Errors on perturbed QPs are ignored. The call of `declines` counts as
+    preparation. If the solver cannot use an operator P (`harness.needs_matrices`) and
+    P has at most MAX_ASSEMBLED_ROWS rows, P is assembled, which also counts as
+    preparation.
 
-    prepare : function that replaces ``solver.prepare`` in a step of a sequence; see
-        `harness.plugin.Chained`
-    sample_seconds : if preparation and solve take less than half of this time, they are
-        repeated until the repetitions together take about this time, or
-        `MAX_INNER_LOOPS` times. The returned
-        answer is the answer of the first solve. The times are means over the
-        repetitions, because the first solve runs with cold caches. Every repetition
-        receives a QP of new objects, so that the solver cannot recognise the QP by
-        identity
-    starts, ends : called just before the clock starts and just after the clock stops
+    prepare : function that replaces ``solver.prepare`` in a step of a sequence, see
+        `harness.plugin.Chained`; the step is solved once
+    once : True for a single solve, which is timed
+    perturbs : False to omit the solves of perturbed QPs
+    starts : called just before the first solve
+    solved : called after the first solve
+    ends : called after the last solve
     """
-    preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
+    run = _Run(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
         starts()
         try:  # only solver code may run here: bugs of the harness must be raised
-            answer, seconds, peaks = _timed(preparation, qp)
-            first = sum(seconds)
-            inner = _inner(first, sample_seconds)
-            if inner > 1:
-                repeated = [
-                    _timed(preparation, _fresh_copy(qp), peaks=False)[1]
-                    for _ in range(inner)
-                ]
-                seconds = tuple(
-                    sum(phase) / inner for phase in zip(*repeated, strict=True)
-                )
-        except _DeclinedError as e:
-            return _without_point(qp, Status.DECLINED, one_line(e))
-        except ImportError as e:
-            name = e.name or str(e)
-            message = f"not installed: {name} (pip install {name.partition('.')[0]})"
-            return _without_point(qp, Status.DECLINED, one_line(message))
-        except ReasonError as e:
+            try:
+                answer, seconds, peaks = run(qp, peaks=True)
+            finally:
+                solved()
+            repeats, remembered, untimed = [seconds], None, 0
+            if not (once or prepare or sum(seconds) > MAX_UNTIMED_SECONDS):
+                rest = _Perturbed(run, qp, answer) if perturbs else None
+                answer, repeats = _repeated(run, qp, rest)
+                remembered = None if rest is None else rest.remembered(repeats)
+                untimed = run.solves - len(repeats)
+        except DeclinedError as e:
+            return _without_point(qp, Status.DECLINED, str(e))
+        except SolverError as e:
             return _without_point(qp, Status.FAILED, str(e))
-        except (Exception, SystemExit) as e:
-            return _without_point(qp, Status.FAILED, failure(solver, e))
         finally:
             ends()
+    means = [sum(phase) / len(repeats) for phase in zip(*repeats, strict=True)]
     cost = Measurement(
-        prepare_seconds=seconds[0],
-        solve_seconds=seconds[1],
-        total_seconds=sum(seconds),
+        prepare_seconds=means[0],
+        solve_seconds=means[1],
+        total_seconds=sum(means),
         peak_mib=max((p for p in peaks if p is not None), default=None),
         prepare_peak_mib=peaks[0],
         solve_peak_mib=peaks[1],
-        inner_loops=inner,
+        inner_loops=len(repeats),
+        untimed_loops=untimed,
+        remembered=remembered,
     )
-    return Timed(_checked(answer, qp), cost, first if inner > 1 else None)
+    return Timed(_checked(answer, qp), cost, run.worked_seconds, run.solves)
 
 
-@dataclass(frozen=True)
-class _Preparation:
-    """Timed preparation by a solver: call of `declines`, assembly of P, `prepare`."""
+def solve_once(
+    solver: Solver, qp: QP, tol: float, prepare: Prepare | None = None
+) -> tuple[Solution, float]:
+    """Solve `qp` once; return the answer and the time of preparation and solve (s).
 
-    solver: Solver
-    prepare: Prepare
+    prepare : see `measure`
 
-    def __call__(self, qp: QP) -> Callable[[], Solution]:
-        reason = reason_to_decline(self.solver, qp)
+    Raises
+    ------
+    DeclinedError
+        If the solver declines the QP, or its package is not installed.
+    SolverError
+        If the solver raises an exception.
+
+    """
+    run = _Run(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
+    with _garbage_collection_off():
+        answer, seconds, _ = run(qp)
+    s = _checked(answer, qp)
+    if s.status is Status.DECLINED:
+        raise DeclinedError(s.message)
+    return s, sum(seconds)
+
+
+class DeclinedError(Exception):
+    """Refusal of a QP by a solver; the message is the reason, in one line."""
+
+
+class SolverError(Exception):
+    """Exception of a solver; the message describes it in one line."""
+
+
+class _Run:
+    """Timed solves by one solver, with their number and their total time."""
+
+    def __init__(self, solver: Solver, prepare: Prepare) -> None:
+        self._solver = solver
+        self._prepare = prepare
+        self.solves = 0
+        self.worked_seconds = 0.0
+
+    def __call__(
+        self, qp: QP, *, peaks: bool = False
+    ) -> tuple[object, tuple[float, float], tuple[float | None, float | None]]:
+        """Prepare and solve once.
+
+        Returns the answer, the times of preparation and solve (s), and the memory peaks
+        of preparation and solve (MiB; None if not measured).
+        """
+        process, self.solves = os.getpid(), self.solves + 1
+        entered = perf_counter()
+        try:
+            reset = peaks and reset_peak()
+            start = perf_counter()
+            solve = self._prepared(qp)
+            ready = perf_counter()
+            prepare_peak = memory_mib("VmHWM") if reset else None
+            reset = peaks and reset_peak()
+            resumed = perf_counter()
+            answer = solve()
+            end = perf_counter()
+            solve_peak = memory_mib("VmHWM") if reset else None
+        except (DeclinedError, SolverError):
+            raise
+        except ImportError as e:
+            about = getattr(self._solver, "about", None)
+            if isinstance(about, About) and (missing := about.missing):
+                raise DeclinedError(one_line(missing)) from None
+            raise SolverError(failure(self._solver, e)) from e
+        except (Exception, SystemExit) as e:
+            raise SolverError(failure(self._solver, e)) from e
+        finally:
+            if os.getpid() != process:
+                os._exit(0)  # a child that the solver forked, and that returned
+            self.worked_seconds += perf_counter() - entered
+        if isinstance(qp.P, SerialisableOperator):
+            qp.P.forget()
+        return answer, (ready - start, end - resumed), (prepare_peak, solve_peak)
+
+    def _prepared(self, qp: QP) -> Callable[[], Solution]:
+        """Call `declines`, assemble P if the solver needs its entries, and prepare."""
+        reason = reason_to_decline(self._solver, qp)
         if reason == NEEDS_MATRICES and not qp.is_explicit:
             qp = _explicit(qp)
-            reason = reason_to_decline(self.solver, qp)
+            reason = reason_to_decline(self._solver, qp)
         if reason is not None:
-            raise _DeclinedError(reason)
+            raise DeclinedError(one_line(reason))
         if isinstance(qp.P, SerialisableOperator):
             qp.P.build()
-        return self.prepare(qp)
+        return self._prepare(qp)
 
 
-class ReasonError(Exception):
+class _Perturbed:
+    """Solves of perturbed QPs, with which the timed solves are compared."""
+
+    def __init__(self, run: _Run, qp: QP, answer: object) -> None:
+        self._run = run
+        self._qp = qp
+        first = _checked(answer, qp)
+        # False if there is no perturbation, or the solver fails on a perturbed QP
+        self._is_possible = first.status is Status.SOLVED
+        self._answers = [first]  # answers to `qp` and to the last perturbed QP
+        self._same = False  # True if the same point was returned for two QPs
+        self._seconds: list[float] = []
+        self.total_seconds = 0.0  #: total time of the solves, s
+
+    def solve(self) -> None:
+        """Solve one further perturbed QP, and ignore errors of the solver."""
+        if not self._is_possible:
+            return
+        self._is_possible = False
+        start = perf_counter()
+        try:
+            other = perturbed(self._qp, next(_perturbations))
+            self._run.worked_seconds += perf_counter() - start
+            if other is None:
+                return
+            answer, seconds, _ = self._run(other)
+        except (DeclinedError, SolverError, MemoryError):
+            return
+        s = _checked(answer, other)
+        self._is_possible = s.status is Status.SOLVED
+        self._same |= self._is_possible and any(
+            all(np.array_equal(getattr(s, v), getattr(old, v)) for v in _VECTORS)
+            for old in self._answers
+        )
+        self._answers[1:] = [s]
+        self._seconds.append(sum(seconds))
+        self.total_seconds += sum(seconds)
+
+    def remembered(self, repeats: Sequence[tuple[float, float]]) -> bool | None:
+        """Return True if the solver reuses answers; None if this cannot be decided.
+
+        repeats : times of the timed solves, s
+        """
+        # shortest times, since other programs may delay single solves
+        limit = REMEMBERED_SPEEDUP * min(map(sum, repeats))
+        while self._is_possible and len(self._seconds) < MIN_PERTURBED_SOLVES:
+            if min(self._seconds) <= limit:
+                break
+            self.solve()
+        if not self._is_possible:
+            return None
+        return self._same or min(self._seconds) > limit
+
+
+def _repeated(
+    run: _Run, qp: QP, rest: _Perturbed | None
+) -> tuple[object, list[tuple[float, float]]]:
+    """Repeat a solve; return the last answer and the times of the timed solves.
+
+    Each timed solve receives a QP of new objects, so that the solver cannot recognise
+    the QP by identity.
+    """
+    repeats: list[tuple[float, float]] = []
+    total = 0.0
+    while not repeats or (total < SAMPLE_SECONDS and len(repeats) < MAX_INNER_LOOPS):
+        if rest is not None and rest.total_seconds < MAX_PERTURBED_SECONDS:
+            rest.solve()
+        answer, seconds, _ = run(_fresh_copy(qp))
+        repeats.append(seconds)
+        total += sum(seconds)
+    return answer, repeats
+
+
+def perturbed(qp: QP, number: int) -> QP | None:
+    """Return `qp` with another objective, or None if the objective is zero.
+
+    With f between 1.01 and 1.02, q is multiplied by f, and an explicit P is divided by
+    f. The constraints are unchanged, P and P/f have the same null space, and on this
+    space qᵀd and f qᵀd have the same sign. The perturbed QP is therefore solvable if
+    `qp` is, and about as difficult. A P that is an operator, or to which a `structure`
+    belongs, is not changed.
+
+    number : different numbers yield different f, since multiples of the golden ratio
+        are distinct modulo 1
+    """
+    f = 1.01 + 0.01 * (number * _GOLDEN_RATIO % 1)
+    changes: dict[str, Any] = {"q": _scaled(qp.q, f)}
+    if qp.is_explicit and qp.structure is None:
+        changes["P"] = _scaled(qp.P, 1 / f)
+    if not any(np.any(_entries(M)) for M in changes.values()):
+        return None
+    other = _fresh_copy(qp)
+    vars(other).update(changes)
+    return other
+
+
+def _scaled(M: Any, factor: float) -> Any:
+    """Return a read-only multiple of a vector or matrix."""
+    M = M * factor
+    _entries(M).flags.writeable = False
+    return M
+
+
+def _entries(M: Any) -> Any:
+    return M.data if issparse(M) else M
+
+
+class ReasonError(SolverError):
     """Error of a solver: `accepts` or the result of `declines` has the wrong type."""
 
 
@@ -179,38 +386,11 @@ def _explicit(qp: QP) -> QP:
     """Return the QP with its operator P as a matrix; raise if P is too large."""
     n = qp.q.size
     if n > MAX_ASSEMBLED_ROWS or too_large(n, 3):
-        raise _DeclinedError(
+        raise DeclinedError(
             f"{NEEDS_MATRICES}; P is an operator with {n} rows; operators are "
             f"assembled up to {MAX_ASSEMBLED_ROWS} rows, if memory allows"
         )
     return replace(qp, P=assembled(qp.P))
-
-
-class _DeclinedError(Exception):
-    """Refusal of a QP by a solver; the message contains the reason."""
-
-
-def _timed(
-    prepare: Prepare, qp: QP, *, peaks: bool = True
-) -> tuple[object, tuple[float, ...], tuple[float | None, float | None]]:
-    """Prepare and solve once.
-
-    Returns the answer, the times of preparation and solve (s), and the memory peaks of
-    preparation and solve (MiB; None if not measured).
-    """
-    reset = peaks and reset_peak()
-    start = perf_counter()
-    solve = prepare(qp)
-    ready = perf_counter()
-    prepare_peak = memory_mib("VmHWM") if reset else None
-    reset = peaks and reset_peak()
-    resumed = perf_counter()
-    answer = solve()
-    end = perf_counter()
-    solve_peak = memory_mib("VmHWM") if reset else None
-    if isinstance(qp.P, SerialisableOperator):
-        qp.P.forget()
-    return answer, (ready - start, end - resumed), (prepare_peak, solve_peak)
 
 
 def _fresh_copy(qp: QP) -> QP:
@@ -241,13 +421,6 @@ def _with_parts(whole: T, other: Callable[[Any], Any]) -> T:
     new = copy(whole)  # skip __init__, whose checks may take longer than a solve
     vars(new).update({name: other(part) for name, part in vars(whole).items()})
     return new
-
-
-def _inner(seconds: float, sample_seconds: float) -> int:
-    """Return the number of repetitions that together take about `sample_seconds`."""
-    if seconds >= sample_seconds / 2:
-        return 1
-    return min(ceil(sample_seconds / max(seconds, 1e-9)), MAX_INNER_LOOPS)
 
 
 def memory_mib(key: str, process: int | str = "self") -> float | None:

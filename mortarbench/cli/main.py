@@ -344,6 +344,12 @@ _COMMANDS = {
             ),
             _option("set an option of the solver"),
             _Option(
+                "--time-limit",
+                "SECONDS",
+                "limit for the solve; default: 300",
+                {"default": 300.0},
+            ),
+            _Option(
                 "--mpi --ranks",
                 "N",
                 "solve on N MPI processes; N > 1 only for cases that are decomposed "
@@ -502,6 +508,12 @@ _COMMANDS = {
                 "solver", "NAME", "a solver, or a pattern such as 'p*'", {"nargs": "+"}
             ),
             _PLUGIN,
+            _Option(
+                "--time-limit",
+                "SECONDS",
+                "limit for each check; default: 10",
+                {"default": 10.0},
+            ),
         ],
         excluding=[
             _Option(

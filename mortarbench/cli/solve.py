@@ -17,6 +17,7 @@ from mortarbench.arguments import (
     check_scale,
     tolerance,
 )
+from mortarbench.harness import checked
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, say
 from mortarbench.harness.names import assemble, is_shared, parse
@@ -47,6 +48,7 @@ def run(registries: Registries, options: Namespace) -> int:
     if options.out is not None:
         check_output_file(options.out, ARCHIVES)
     ranks_asked(options.mpi, "--mpi")
+    checked.positive("--time-limit", options.time_limit)
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
     check_name(options.solver, registries.solvers)
@@ -55,18 +57,27 @@ def run(registries: Registries, options: Namespace) -> int:
     defer_parts_of_numpy()
     from mortarbench.answer import solver_session
     from mortarbench.case import Case
+    from mortarbench.progress import waiting
 
     pictures = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
     is_builtin = registries.hold_only_builtins()
     forks = is_builtin and not _imports_from_working_directory()
     session = solver_session(
-        options.solver, registries, changed, forks=forks, ranks=options.mpi
+        options.solver,
+        registries,
+        changed,
+        forks=forks,
+        ranks=options.mpi,
+        time_limit=options.time_limit,
     )
-    with session as solve:
+    with session as solve, waiting() as progress:
+        progress(f"building {parsed.name}")
         case = Case(id=parsed, registries=registries)
         if pictures or options.mpi == 1 or not (is_builtin and is_shared(parsed)):
             # built after the fork, so that the worker does not inherit the memory
             _build(case, pictures)
+        limit = f"time limit {options.time_limit:g} s"
+        progress(f"solving {parsed.name} with {options.solver}, {limit}")
         answer = solve(case, options.tol)
     _print(answer, options)
     if pictures or options.out is not None:

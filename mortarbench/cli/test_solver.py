@@ -7,6 +7,7 @@ import json
 from argparse import Namespace
 from collections.abc import Collection
 
+from mortarbench.harness import checked
 from mortarbench.harness.errors import say
 from mortarbench.harness.registry import SolverSpec, check_name, resolve
 from mortarbench.registries import Registries
@@ -14,6 +15,7 @@ from mortarbench.registries import Registries
 
 def run(registries: Registries, options: Namespace) -> int:
     """Run all checks; return 1 if a check fails or a solver solves no QP."""
+    checked.positive("--time-limit", options.time_limit)
     registries = registries.with_files(options.plugin)
     specs = [
         SolverSpec(name=name, label=name)
@@ -28,6 +30,7 @@ def run(registries: Registries, options: Namespace) -> int:
         INVARIANCE_PREFIX,
     )
     from mortarbench.harness.conformance.weaknesses import weaknesses_page
+    from mortarbench.progress import waiting
     from mortarbench.validation import test_solver
 
     for spec in specs:
@@ -39,9 +42,17 @@ def run(registries: Registries, options: Namespace) -> int:
     ]
     results = []
     for spec in specs:
-        results.append(test_solver(spec.name, checks=checks, registries=registries))
+        with waiting() as progress:
+            result = test_solver(
+                spec.name,
+                checks=checks,
+                time_limit=options.time_limit,
+                progress=progress,
+                registries=registries,
+            )
+        results.append(result)
         if not options.json and not options.markdown:
-            print(results[-1])
+            print(result)
     if options.markdown:
         print(weaknesses_page({one.solver: one.results for one in results}), end="")
         return 0

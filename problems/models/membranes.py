@@ -191,7 +191,7 @@ class Membranes:
 
     def factorise(self) -> GeneralisedInverse:
         """Factorise K on the free components; the right membrane may move rigidly."""
-        free = np.setdiff1d(np.arange(self.qp.q.size), self.qp.A.indices)
+        free = np.setdiff1d(np.arange(self.qp.q.size), csr_array(self.qp.A).indices)
         return supported_inverse(self.qp.P, free, self.rigid)
 
     def quantities(self, s: Solution) -> dict[str, Any]:

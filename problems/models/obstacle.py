@@ -173,7 +173,7 @@ def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
         E=np.ones(1),
         names=("string",),
         load=lambda node: -qp.q[node],
-        fixed=qp.A.indices,
+        fixed=csr_array(qp.A).indices,
         contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)),
         glue=p["glue"],
         cluster=p["cluster"],
@@ -276,7 +276,7 @@ class Problem:
 
     def factorise(self) -> GeneralisedInverse:
         """Factorise K without the prescribed components."""
-        return regular_inverse(self.qp.P, self.qp.G.indices)
+        return regular_inverse(self.qp.P, csr_array(self.qp.G).indices)
 
     def floating(self) -> GeneralisedInverse:
         """Factorise the whole K, with constants as kernel, for the form dual."""
@@ -318,7 +318,7 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
 
 def bound_form(rows: QP) -> Transformed:
     """Eliminate the prescribed components, and replace −v ≤ −ψ by bounds v ≥ ψ."""
-    free = rows.G.indices
+    free = csr_array(rows.G).indices
     n, m = rows.q.size, free.size
     K = csc_array(rows.P)
     qp = QP(

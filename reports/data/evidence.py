@@ -125,6 +125,18 @@ class Outcome:
         known = [v for name in RESIDUALS if (v := self.largest(name)) is not None]
         return max(known) if len(known) == len(RESIDUALS) else None
 
+    @cached_property
+    def remembered(self) -> bool:
+        """True if the solver reused answers, so that its times are not those of solves.
+
+        The methods of this class then return no times.
+        """
+        return any(r.remembered for r in self.records)
+
+    @property
+    def _timed(self) -> tuple[Record, ...]:
+        return () if self.remembered else self.records
+
     def seconds(self, phase: str) -> Interval | None:
         """Return the median prepare, solve or total time, s; None if none is known."""
         return self._intervals[phase]
@@ -136,13 +148,13 @@ class Outcome:
 
     def seconds_by_block(self, phase: str) -> dict[Block, float]:
         """Return the time of one phase by block, s; unknown times are omitted."""
-        times = {(r.session, r.repeat): _seconds(r, phase) for r in self.records}
+        times = {(r.session, r.repeat): _seconds(r, phase) for r in self._timed}
         return {block: t for block, t in times.items() if t}
 
     @cached_property
     def _intervals(self) -> dict[str, Interval | None]:
         return {
-            phase: _median(_seconds(r, phase) for r in self.records)
+            phase: _median(_seconds(r, phase) for r in self._timed)
             for phase in ("prepare", "solve", "total")
         }
 
@@ -160,7 +172,7 @@ class Outcome:
         """Median total time including dualisation; None if `dualising` is None."""
         return _median(
             r.total_seconds + r.dualise_seconds
-            for r in self.records
+            for r in self._timed
             if r.total_seconds is not None and r.dualise_seconds
         )
 

@@ -1,8 +1,9 @@
 """The fastest solver at equal verified accuracy, per form, and its significance.
 
 A solver competes if it was verified on every case of the group that at least one solver
-solved. The first competitor is the one with the smallest geometric mean of times. It is
-called the fastest only if every other competitor is significantly slower:
+solved, and if it reused no answers of earlier solves (`Record.remembered`). The first
+competitor is the one with the smallest geometric mean of times. It is called the
+fastest only if every other competitor is significantly slower:
 
 - with at least `CASES` cases, if the interval of the ratio over the cases is above 1;
 - with fewer cases, if the interval of the ratio within blocks (repeats of one session)
@@ -77,6 +78,7 @@ class Competitor:
     #: True if `ratio` is over cases, and on some case that both solved, the solver has
     #: no block in common with the first solver
     apart: bool = False
+    remembers: bool = False  #: True if the solver reuses answers of earlier solves
 
     @property
     def verified(self) -> tuple[str, ...]:
@@ -118,6 +120,11 @@ class FastestSolver:
     def tied(self) -> tuple[Competitor, ...]:
         """The other competitors that are not significantly slower than the first."""
         return tuple(c for c in self.competitors[1:] if not c.slower)
+
+    @property
+    def remembering(self) -> tuple[Competitor, ...]:
+        """The solvers that reuse answers of earlier solves."""
+        return tuple(c for c in self.others if c.remembers)
 
     @property
     def following(self) -> Competitor | None:
@@ -186,13 +193,19 @@ def _fastest(group: ComparisonGroup, rows: Mapping[str, Row]) -> FastestSolver:
     # a sequence that ended early may leave too few solved cases
     over_cases = group.comparable and len(solved) >= CASES
     entered = [
-        Competitor(solver=s, outcomes={case: row[s] for case, row in solved.items()})
+        Competitor(
+            solver=s,
+            outcomes={case: row[s] for case, row in solved.items()},
+            remembers=any(row[s].remembered for row in rows.values()),
+        )
         for s in group.solvers
     ]
-    full = [c for c in entered if len(c.verified) == len(solved) > 0]
+    full = [
+        c for c in entered if len(c.verified) == len(solved) > 0 and not c.remembers
+    ]
     full.sort(key=_geometric_mean)
     others = [c for c in entered if c not in full]
-    others.sort(key=lambda c: -len(c.verified))
+    others.sort(key=lambda c: (c.remembers, -len(c.verified)))
     if full:
         first = full[0]
         compared = [_compared(c, first, group, over_cases) for c in full[1:]]

@@ -183,6 +183,8 @@ def _ratio(c: Competitor, f: FastestSolver, case: str) -> Ratio | float:
 
 def _failure(c: Competitor) -> str:
     """Return the most frequent verdict of unverified answers, with its count."""
+    if c.remembers:
+        return "reuses answers"
     count = Counter(o.verdict for o in c.outcomes.values() if time_of(o) is None)
     if not count:
         return ""

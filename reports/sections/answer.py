@@ -288,7 +288,8 @@ def _roughly(f: FastestSolver) -> str:
 
 def _faster_elsewhere(f: FastestSolver) -> list[str]:
     """Name significantly faster solvers that were not verified on every case."""
-    faster = [c for c in f.others if c.ratio and c.ratio.high < 1]
+    candidates = (c for c in f.others if not c.remembers)
+    faster = [c for c in candidates if c.ratio and c.ratio.high < 1]
     return TEXT.parts("faster_elsewhere", f, faster)
 
 
@@ -346,6 +347,9 @@ def _reservations(found: Sequence[FastestSolver]) -> list[str]:
     unsolved = max((f.unsolved for f in found if f.cases), default=0)
     return [
         *[TEXT("unsolved", unsolved)] * bool(unsolved),
+        *TEXT.parts(
+            "remembering", dict.fromkeys(_name(c) for f in found for c in f.remembering)
+        ),
         *dict.fromkeys(note for f in found for note in f.notes),
         *[TEXT("few")] * few,
     ]

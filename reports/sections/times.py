@@ -89,6 +89,7 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
     interval, title = outcome.seconds("total"), source(outcome)
     symbol, ending = VERDICTS[outcome.verdict]
     if interval is None:
+        ending = "reuses answers" if outcome.remembered else ending
         return Cell(text=ending, symbol=symbol, kind="quiet", title=title)
     if not outcome.verified:
         return Cell(text=seconds(interval), after=ending, kind="void", title=title)

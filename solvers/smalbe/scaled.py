@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csc_array, diags_array
 
 from mortarbench.harness import QP, Box, Discs, Matrix, Solution, Vector
 from mortarbench.solvers.smalbe.compiled import IncompleteFactor, scaled_by_diagonal
@@ -81,7 +81,7 @@ class Scaled:
 class ScaledSparse(Scaled):
     """A sparse QP in scaled variables, with data to compute a factor."""
 
-    P: Matrix  #: P of `original`, in CSR or CSC format with sorted indices
+    P: Matrix  #: P of `original`
     diagonal: Vector  #: (n,) diagonal of P
     #: upper bound on the norm of the matrix H of `qp`, from the largest sum Σⱼ|Sᵢⱼ| of
     #: S = D⁻¹ᐟ²PD⁻¹ᐟ²
@@ -93,13 +93,13 @@ class ScaledSparse(Scaled):
     @classmethod
     def of(cls, qp: QP, *, with_factor: bool) -> ScaledSparse:
         """Scale a QP with bounds only and a sparse P with a positive diagonal."""
-        P = _canonical(qp.P)
+        P = qp.P
         diagonal = P.diagonal()
         root, scaled, one = np.sqrt(diagonal), qp, np.ones(diagonal.size)
         inverse = 1 / root
         data, norm, least, least_scaled = scaled_by_diagonal(P, inverse)
         if (most := diagonal.max()) > MAX_UNSCALED * diagonal.min():
-            P_scaled = csr_array((data, P.indices, P.indptr), shape=P.shape)
+            P_scaled = csc_array((data, P.indices, P.indptr), shape=P.shape)
             scaled = QP(
                 P=P_scaled,
                 q=qp.q * inverse,
@@ -127,13 +127,3 @@ class ScaledSparse(Scaled):
         """Return the incomplete factor of H/norm, where H is the matrix of `qp`."""
         scale = np.sqrt(self.norm) * self.root * self.weights
         return IncompleteFactor(self.P, self.weights, scale, self.has_weights)
-
-
-def _canonical(P: Matrix) -> Matrix:
-    """Return a symmetric sparse P with sorted indices and without duplicate entries."""
-    if P.format not in ("csc", "csr"):
-        P = csr_array(P)
-    if not P.has_canonical_format:
-        P = P.copy()
-        P.sum_duplicates()
-    return P

@@ -10,10 +10,11 @@ import cvxpy
 import numpy as np
 import pytest
 import qpsolvers
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_array
 
 import mortarbench as mb
 from mortarbench.harness import plugin
+from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 from tests.support.active_row import QP, ActiveRow
@@ -317,13 +318,23 @@ def test_verify_agrees_with_solve(form):
 
 
 @pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
-def test_sparse_matrices_of_a_case_are_csc_with_narrow_indices(form):
-    """qpsolvers requires csc_matrix, and OSQP requires 32-bit indices."""
-    qp = mb.build(f"beam-ring/Nr=4/Nh=3/steps=1/{form}").qp
-    for M in (qp.P, qp.G, qp.A):
+def test_a_case_and_a_worker_have_the_same_matrices(form, tmp_path):
+    """Sparse matrices are csc_array; OSQP requires 32-bit indices."""
+    built = mb.build(f"beam-ring/Nr=4/Nh=3/steps=1/{form}").qp
+    save_qp(tmp_path / "qp.npz", built, serialised=True)
+    mapped, _ = load_qp(tmp_path / "qp.npz", operators={})
+    for name in "PGA":
+        M, other = getattr(built, name), getattr(mapped, name)
+        assert type(M) is type(other)
         if not isinstance(M, np.ndarray):
-            assert isinstance(M, csc_matrix)
-            assert {M.indices.dtype, M.indptr.dtype} == {np.dtype(np.int32)}
+            assert type(M) is csc_array
+            for part in ("data", "indices", "indptr"):
+                mine, its = getattr(M, part), getattr(other, part)
+                assert mine.dtype == its.dtype
+                assert np.array_equal(mine, its)
+                assert mine.flags.writeable is its.flags.writeable
+            assert not M.data.flags.writeable
+            assert M.indices.dtype == M.indptr.dtype == np.int32
             assert M.has_canonical_format
 
 

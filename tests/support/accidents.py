@@ -230,7 +230,23 @@ class PatchesTheClock(Honest):
         return at_the_row(qp)
 
 
-class Remembers(Honest):
+class OnAll(Honest):
+    """Correct solver of the QPs of `tiny` with any multiple of the objective."""
+
+    def prepare(self, qp, tol):
+        if qp.h.size != 1 or qp.q.size != 2:  # the warm-up
+            return super().prepare(qp, tol)
+        return lambda: self.act(qp)
+
+    def at_the_row(self, qp):
+        """Return the point with x₁ = h: z = −(P x + q)₁ and z_box = −(P x + q)₂."""
+        gradient = qp.P.diagonal() * np.array([qp.h[0], 0.0]) + qp.q
+        return replace(
+            at_the_row(qp), z=-gradient[:1], z_box=np.array([0.0, -gradient[1]])
+        )
+
+
+class Remembers(OnAll):
     """Solver that works for 16 ms once per QP, and later returns a cached answer."""
 
     known: ClassVar[dict] = {}
@@ -239,8 +255,39 @@ class Remembers(Honest):
         key = qp.q.tobytes()
         if key not in self.known:
             spin(0.016)
-            self.known[key] = at_the_row(qp)
+            self.known[key] = self.at_the_row(qp)
         return self.known[key]
+
+
+class Compiles(OnAll):
+    """Solver that works for 0.3 s in the first solve of each shape, as JAX does."""
+
+    shapes: ClassVar[set] = set()
+
+    def act(self, qp):
+        if qp.P.shape not in self.shapes:
+            spin(0.3)
+            self.shapes.add(qp.P.shape)
+        spin(0.0005)
+        return self.at_the_row(qp)
+
+
+class DiesOnOthers(OnAll):
+    """Solver whose process ends if the objective is not that of `tiny`."""
+
+    def act(self, qp):
+        if qp.q[0] != -4.0:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        return self.at_the_row(qp)
+
+
+class HangsOnOthers(OnAll):
+    """Solver that hangs if the objective is not that of `tiny`."""
+
+    def act(self, qp):
+        if qp.q[0] != -4.0:
+            time.sleep(3600)
+        return self.at_the_row(qp)
 
 
 class WorksInDeclines(Honest):

@@ -25,6 +25,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Case, Fields, InputError, Solution, Status, no_rows
 from mortarbench.harness.errors import PastEndError
+from mortarbench.harness.plugin import About
 from mortarbench.harness.processes import case_worker as generator
 from mortarbench.harness.processes.worker import serve
 from mortarbench.harness.verify import measure as measuring
@@ -271,13 +272,13 @@ class SleepsByPower(Honest):
     clock: ClassVar[list[float]] = [0.0]
 
     def prepare(self, qp, tol):
-        if (qp.q != 1).any():  # the warm-up
+        if (qp.q != qp.q[0]).any():  # the warm-up
             self.clock[0] = time.perf_counter()
             measuring.perf_counter = lambda: self.clock[0]
         return lambda: self.act(qp)
 
     def act(self, qp):
-        if (qp.q == 1).all():
+        if (qp.q == qp.q[0]).all():
             noise = 1.01 if qp.q.size in (10, 80) else 0.99
             seconds = 0.02 * (qp.q.size / 10) ** 1.5 * noise
             time.sleep(seconds)
@@ -412,9 +413,29 @@ class Declines(Honest):
         return "never on a Monday"
 
 
-class Lacks(Honest):
+class LacksUndeclared(Honest):
+    """Solver that imports a missing module, which it does not declare."""
+
     def prepare(self, qp, tol):
         import a_library_nobody_has  # noqa: F401
+
+
+class Lacks(LacksUndeclared):
+    """Solver that declares the missing package."""
+
+    about = About(
+        title="", method="", licence="", linear_solver="", phases="",
+        package="a_library_nobody_has",
+    )  # fmt: skip
+
+
+class Breaks(Honest):
+    """Solver that declares an installed package, in which a name is missing."""
+
+    about = replace(Lacks.about, package="numpy")
+
+    def prepare(self, qp, tol):
+        from numpy import no_such_function  # noqa: F401
 
 
 class NumpyScalars(Honest):

@@ -64,6 +64,95 @@ class Remembers(Sound):
 MEMORY = []
 
 
+class Caches(Sound):
+    """Solver that solves each QP with a new key once; `key` is set by subclasses."""
+
+    def act(self, qp, tol):
+        answers = MEMORIES.setdefault(type(self).__name__, {})
+        key = self.key(qp)
+        if key not in answers:
+            # the object is kept, so that its address is not reused
+            answers[key] = qp, self.honest(qp, tol)
+        return answers[key][1]
+
+
+class CachesById(Caches):
+    def key(self, qp):
+        return id(qp)
+
+
+class CachesByContent(Caches):
+    def key(self, qp):
+        return qp.q.tobytes()
+
+
+class CachesByShape(Caches):
+    def key(self, qp):
+        return qp.P.shape, qp.A.shape, qp.G.shape
+
+
+class CachesByAddress(Caches):
+    def key(self, qp):
+        return qp.q.ctypes.data
+
+
+class CachesInChains(CachesByContent):
+    """Solver that reuses answers of earlier sequences, but not of single QPs."""
+
+    def prepare(self, qp, tol):
+        return lambda: self.honest(qp, tol)
+
+    def chain(self, tol):
+        return lambda qp: lambda: self.act(qp, tol)
+
+
+class CachesThePreparation(Sound):
+    """Solver whose preparation, which takes 0.2 s, is reused for an equal P."""
+
+    def prepare(self, qp, tol):
+        known = MEMORIES.setdefault("preparation", set())
+        if (key := qp.P.data.tobytes()) not in known:
+            time.sleep(0.2)
+            known.add(key)
+        return super().prepare(qp, tol)
+
+
+class Compiles(Sound):
+    """Solver that takes 0.3 s longer in the first solve of each shape, as JAX does."""
+
+    def key(self, qp):
+        return qp.P.shape, qp.A.shape, qp.G.shape
+
+    def act(self, qp, tol):
+        known = MEMORIES.setdefault(type(self).__name__, set())
+        if (key := self.key(qp)) not in known:
+            time.sleep(0.3)
+            known.add(key)
+        return self.honest(qp, tol)
+
+
+class CompilesOnce(Compiles):
+    """Solver that takes 0.3 s longer in its first solve, as with Numba."""
+
+    def key(self, qp):
+        return "any"
+
+
+class ReusesPatterns(Compiles):
+    """Solver that analyses each sparsity pattern once, in 0.3 s."""
+
+    def key(self, qp):
+        return qp.P.indices.tobytes()
+
+
+MEMORIES = {}
+
+
+class Raises(Sound):
+    def act(self, qp, tol):
+        raise ValueError("not today")
+
+
 class Wanders(Sound):
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -180,5 +269,7 @@ class Dies(Sound):
 
 SOLVERS = {
     "sound": Sound(), "dies": Dies(), "declines": DeclinesAll(), "minds": MindsUnits(),
-    "slow": SlowInNewtons(), "false": SaysFalse(),
+    "slow": SlowInNewtons(), "false": SaysFalse(), "raises": Raises(),
+    "id": CachesById(), "content": CachesByContent(), "shape": CachesByShape(),
+    "compiles": Compiles(),
 }  # fmt: skip

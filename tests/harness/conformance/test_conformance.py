@@ -18,7 +18,6 @@ from mortarbench.harness.conformance.conformance import (
 )
 from mortarbench.harness.conformance.equivalence import (
     CHANGES,
-    DeclinedError,
     WeaknessError,
     answer,
     changes_of,
@@ -32,20 +31,32 @@ from mortarbench.harness.conformance.manufactured import (
 )
 from mortarbench.harness.conformance.weaknesses import line_of
 from mortarbench.harness.verify.kkt import kkt_residuals
+from mortarbench.harness.verify.measure import DeclinedError
 from mortarbench.solvers import SOLVERS
 from mortarbench.validation import Conformance
 from tests.support import FAULTY_SOLVERS, ROOT
 from tests.support.faulty_solvers import (
+    MEMORIES,
     MEMORY,
     AlwaysSolved,
+    CachesByAddress,
+    CachesByContent,
+    CachesById,
+    CachesByShape,
+    CachesInChains,
+    CachesThePreparation,
+    Compiles,
+    CompilesOnce,
     DeclinesAll,
     FlipsSigns,
     HoldsAbsentBounds,
     LeavesRoundOff,
     MindsTheOrder,
     MindsUnits,
+    Raises,
     Remembers,
     RepeatsTheFirst,
+    ReusesPatterns,
     Scales,
     Silent,
     Slow,
@@ -110,6 +121,7 @@ def test_a_planted_point_is_a_solution(shape, dense):
     assert kkt_residuals(qp, expected).worst < 1e-13
 
 
+OPTIONS = "refuses a misspelt option"
 UNBOUNDED = "claims no success: unbounded"
 MEMBRANE = "finds where a membrane of 400 nodes touches"
 #: checks in which a solver takes seconds, mostly to reach its iteration limit
@@ -135,7 +147,7 @@ FOR_ALL = {
     "finds the planted solution: bounds, sparse",
     "finds the planted solution: everything, sparse",
     "gives multipliers our signs",
-    "refuses a misspelt option",
+    OPTIONS,
     "claims no success: infeasible",
     "takes or declines an operator",
 }
@@ -262,6 +274,54 @@ def test_a_sound_solver_fails_no_check(check):
 def test_a_check_catches_its_fault(kind, check):
     MEMORY.clear()
     assert run_check(check, kind()).grade is Grade.FAIL
+
+
+ANOTHER = "returned the answer of another QP of the same shape"
+AGAIN = "the second solve of a QP took .* s, solves of other QPs of the same shape"
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (CachesById, AGAIN),
+        (CachesByContent, AGAIN),
+        (CachesByShape, ANOTHER),
+        (CachesByAddress, AGAIN),
+        (CachesThePreparation, AGAIN),
+    ],
+)
+@pytest.mark.parametrize("check", ["bounds", "equalities"])
+def test_a_solver_that_remembers_answers_is_named(kind, message, check):
+    MEMORIES.clear()
+    result = run_check(f"remembers no answer: {check}", kind())
+    assert result.grade is Grade.FAIL
+    assert re.match(message, result.message)
+
+
+@pytest.mark.parametrize("kind", [Sound, Compiles, CompilesOnce, ReusesPatterns])
+def test_a_slow_first_call_is_not_accused(kind):
+    MEMORIES.clear()
+    for check in CHECKS:
+        if check.startswith("remembers no answer: "):
+            grade, message, _ = run_check(check, kind())
+            assert grade in (Grade.PASS, Grade.DECLINE), message
+
+
+def test_answers_of_earlier_sequences_are_not_reused():
+    MEMORIES.clear()
+    checks = ("remembers no answer: bounds", "remembers no answer: bounds, sequences")
+    grades = [run_check(check, CachesInChains()).grade for check in checks]
+    assert grades == [Grade.PASS, Grade.FAIL]
+
+
+@pytest.mark.parametrize("check", [c for c in CHECKS if c != OPTIONS])
+def test_an_exception_is_a_failure(check):
+    grade, message, _ = run_check(check, Raises())
+    if check.startswith("solves over") or "sequence" in check:
+        assert grade is Grade.DECLINE  # no discs, cones or chain()
+    else:
+        assert grade is Grade.FAIL
+        assert re.search(r"ValueError: not today \(faulty_solvers\.py:\d+\)", message)
 
 
 def test_rounding_on_absent_bounds_passes_with_a_remark():

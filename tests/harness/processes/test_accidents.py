@@ -37,7 +37,6 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
 from mortarbench.harness.suite.suite import Suite
-from mortarbench.harness.verify.measure import SAMPLE_SECONDS
 from mortarbench.harness.verify.optimum import proves
 from mortarbench.harness.verify.verdicts import new_record
 from mortarbench.solvers.reference.solve import reference_solution
@@ -50,8 +49,8 @@ ACCIDENTS = load_plugin(PLUGIN)
 TINY = ACCIDENTS.problems["tiny"]
 CASE = assemble(TINY, {}, "plain")
 
-FOREIGN = "was received, expected 'timed'"
-SUSPECT = "results are cached between measurements"
+FOREIGN = "was received, expected 'solved'"
+SUSPECT = "the solver reuses answers of earlier solves"
 PARENTS_TIME = "the parent's time is recorded"
 #: expected verdict and pattern of the message, by solver
 OUTCOMES = {
@@ -154,9 +153,8 @@ class Bench:
             options={}, tol=1e-6, repeat=0, environment="",
         ).replace(qp=self.digest)  # fmt: skip
         request = dict(
-            qp=str(self.folder / "qp.npz"), out=str(self.folder / "point.npz"),
-            sample_seconds=SAMPLE_SECONDS,
-        )  # fmt: skip
+            qp=str(self.folder / "qp.npz"), out=str(self.folder / "point.npz")
+        )
         worker = self.workers[solver]
         return measure_and_judge(
             worker, lambda: self.qp, record, request, time_limit=time_limit,
@@ -199,22 +197,23 @@ CLOCK = Clock(min_seconds=0.1, elapsed_seconds=0.15, max_seconds=0.2)
 
 
 @pytest.mark.parametrize(
-    ("prepare", "solve", "first", "inner", "is_believed"),
+    ("prepare", "solve", "worked", "solves", "is_believed"),
     [
-        (0.05, 0.06, None, 1, True),
-        (0.001, 0.001, 0.1, 10, True),
-        (0.15, 0.06, None, 1, False),  # longer than the wall time
-        (0.05, 0.04, None, 1, False),  # shorter than the CPU time
-        (0.001, 0.001, 0.01, 10, False),
-        (-1e-6, -1e-6, 0.05, 10, False),
+        (0.05, 0.06, 0.11, 1, True),
+        (0.001, 0.001, 0.12, 11, True),
+        (0.15, 0.06, 0.21, 1, False),  # longer than the wall time
+        (0.05, 0.04, 0.09, 1, False),  # shorter than the CPU time
+        (0.001, 0.001, 0.03, 11, False),
+        (-1e-6, -1e-6, -1e-5, 11, False),
     ],
 )
 def test_a_time_is_accepted_within_the_bounds_of_the_parent(
-    prepare, solve, first, inner, is_believed
+    prepare, solve, worked, solves, is_believed
 ):
     seconds = dict(
         prepare_seconds=prepare, solve_seconds=solve, total_seconds=prepare + solve,
-        first_seconds=first, inner=inner,
+        worked_seconds=worked, solves=solves, inner=1, untimed=solves - 1,
+        remembered=None,
     )  # fmt: skip
     reply = Reply(answer=ANSWER | seconds, clock=CLOCK)
     m, *notes = _plausible_cost(reply)
@@ -223,7 +222,7 @@ def test_a_time_is_accepted_within_the_bounds_of_the_parent(
     if is_believed:
         assert m.total_seconds == prepare + solve
     else:
-        assert m.total_seconds == 0.15 / (inner + (first is not None))
+        assert m.total_seconds == 0.15 / solves
         assert m.prepare_seconds is m.solve_seconds is None
 
 
@@ -321,11 +320,28 @@ def test_work_in_declines_is_timed(bench):
     assert record.message == ""
 
 
-def test_a_cache_between_measurements_is_reported(bench):
-    first, second = bench("remembers"), bench("remembers")
+def test_remembered_answers_are_marked_and_a_slow_first_call_is_not(bench):
+    for _ in range(2):
+        record = bench("remembers")
+        assert record.remembered is True
+        assert SUSPECT in record.message
 
-    assert first.message == ""
-    assert SUSPECT in second.message
+        record = bench("compiles")
+        assert record.remembered is False
+        assert record.message == ""
+        assert record.total_seconds < 0.01
+
+
+@pytest.mark.parametrize("solver", ["diesonothers", "hangsonothers"])
+def test_a_process_that_ends_in_a_repetition_does_not_affect_the_verdict(
+    bench, monkeypatch, solver
+):
+    monkeypatch.setattr(supervisor, "REPEAT_SECONDS", 0.5)
+    record = bench(solver)
+
+    assert record.verdict is Verdict.VERIFIED
+    assert (record.inner_loops, record.untimed_loops, record.remembered) == (1, 0, None)
+    assert record.message.startswith("solved only once, since a repeated solve ended: ")
 
 
 def test_a_worker_that_is_killed_before_its_solve_is_a_fault(bench):

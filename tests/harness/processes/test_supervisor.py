@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from mortarbench.harness import Verdict
+from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.processes import reaper, supervisor
 from mortarbench.harness.processes.reaper import descendants
@@ -107,7 +108,7 @@ def test_one_process_serves_every_measurement_on_one_cpu_with_one_thread(
     worker.close()
 
     assert first["pid"] == second["pid"]
-    assert first["cpus"] == [max(os.sched_getaffinity(0))]
+    assert first["cpus"] == [fastest_first(os.sched_getaffinity(0))[0]]
     assert first["threads"] == "1"
     assert not running(first["pid"])
 

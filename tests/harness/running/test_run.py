@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from mortarbench.harness import InputError, Status, Verdict
+from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.errors import FaultError
 from mortarbench.harness.files.store import load_fields, load_solution
 from mortarbench.harness.names import assemble
@@ -124,9 +125,9 @@ OUTCOMES = {
     "raises": (
         Verdict.FAILED,
         "failed",
-        "ValueError: first line second line (adversaries.py:133)",
+        "ValueError: first line second line (adversaries.py:134)",
     ),
-    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:138)"),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:139)"),
     "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
     "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
     "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
@@ -151,9 +152,10 @@ OUTCOMES = {
     "zero": (Verdict.WRONG, "solved", ""),
     "mutates": (
         Verdict.FAILED, "failed",
-        "ValueError: assignment destination is read-only (adversaries.py:388)",
+        "ValueError: assignment destination is read-only (adversaries.py:389)",
     ),
-    "mutatesbyforce": (Verdict.VERIFIED, "solved", ""),
+    # the timed solves are those of another QP, and the last one is judged
+    "mutatesbyforce": (Verdict.FAILED, "failed", ""),
     "declines": (Verdict.DECLINED, "declined", "never on a Monday"),
 }  # fmt: skip
 
@@ -185,10 +187,7 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_valid(
             status, claimed, message = OUTCOMES[solver]
             assert got[solver].verdict == status, (solver, case)
             assert claimed in (..., got[solver].claimed), (solver, case)
-            said = got[solver].message
-            # a pause, or what a library loads in its first call, also causes a note
-            if not said.startswith("the first solve took "):
-                assert message in (None, said)
+            assert message in (None, got[solver].message)
 
 
 def test_a_verified_record_contains_costs_and_quantities(measure, tmp_path):
@@ -227,7 +226,7 @@ def test_a_record_contains_times_of_phases_threads_and_cpu(measure, tmp_path):
     assert (slow.inner_loops, slow.threads, slow.cpu) == (
         1,
         1,
-        max(os.sched_getaffinity(0)),
+        fastest_first(os.sched_getaffinity(0))[0],
     )
     assert slow.solve_seconds >= 0.02
     assert quick.inner_loops > 1  # far below a millisecond

@@ -241,6 +241,35 @@ def test_the_only_verified_solver_is_not_named_the_fastest(record, opened):
     assert claim.endswith(": only lonely was verified.")
 
 
+@pytest.mark.parametrize("make", [one_case, many_cases])
+def test_a_solver_that_reuses_answers_is_never_named_the_fastest(record, opened, make):
+    """A single marked record suffices, also if its time is a hundredth."""
+    cached = make(record, cached=0.01)
+    cached[0] = cached[0].replace(remembered=True)
+    honest = make(record, slow=3.0, fast=1.0)
+    statement = opened(honest + cached)["dual"]
+
+    assert statement.claims[0].startswith("fast was the fastest")
+    assert "cached" not in statement.claims[0]
+    assert statement.remarks[0].startswith(
+        "Not compared, because answers of earlier solves are reused: cached."
+    )
+
+    fresh = [r.replace(remembered=False) for r in cached]
+    statement = opened(honest + fresh)["dual"]
+    assert statement.claims[0].startswith("cached was the fastest")
+
+
+def test_the_only_solver_that_reuses_no_answers_is_not_the_fastest(record, opened):
+    cached = [r.replace(remembered=True) for r in one_case(record, cached=0.01)]
+    (claim,) = opened(one_case(record, lonely=1.0) + cached)["dual"].claims
+    assert claim.endswith(": only lonely was verified without reusing answers.")
+
+    both = [r.replace(remembered=True) for r in one_case(record, other=0.02)]
+    (claim,) = opened(cached + both)["dual"].claims
+    assert claim == "No answer was verified at tol 1e-6 without reusing answers."
+
+
 def test_a_form_without_verified_answers_is_reported(record, opened):
     records = [
         r.replace(verdict=Verdict.ITERATION_LIMIT)
