@@ -8,19 +8,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, vstack
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.problems.contact.bodies import Bodies, ContactSides, UnassembledBodies
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_segment import (
-    ContactRows,
     closest_points,
     geometric_stiffness,
     node_to_segment,
 )
 from mortarbench.problems.contact.rigid import rigid_rows
+from mortarbench.problems.contact.rows import ContactRows, joined
+from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.sides import pair_names
 from mortarbench.problems.contact.space.face_mortar import face_mortar
 from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.contact.surface import current_positions, current_surface
@@ -43,7 +44,7 @@ def linearisation(
 ) -> Callable[[Vector], ContactRows]:
     """Return a function that maps a displacement (n,) in m to the rows of all pairs.
 
-    The returned function raises InputError at zero displacement if no pair has a row.
+    The returned function raises InputError at zero displacement if a pair has no row.
 
     contact : "nts" (node to segment, or node to face in 3D) or "mortar"; pairs with
         a rigid master have nodal rows
@@ -52,55 +53,45 @@ def linearisation(
     fixed_segments : (places,) segment of each slave node for node-to-segment contact,
         numbered as in `closest_segments`; −1 selects the closest segment at each u
     """
-    pairs = len(bodies.pairs)
     nodal, integral = METHODS[bodies.mesh.dim]
-    methods: list[Callable[..., ContactRows]] = [
-        nodal if contact == "nts" else partial(integral, basis=basis)
-    ] * pairs
+    elastic = nodal if contact == "nts" else partial(integral, basis=basis)
+    methods = [
+        partial(elastic, reach=Reach(distance=pair.reach))
+        if pair.rigid is None
+        else partial(rigid_rows, reach=pair.reach)
+        for pair in bodies.pairs
+    ]
     if fixed_segments is not None:
         parts = _split_by_pair(bodies, fixed_segments)
-        methods = [partial(node_to_segment, fixed_segments=part) for part in parts]
-    has_friction = [law.acts for law in laws] or [False] * pairs
+        methods = [
+            partial(method, fixed_segments=part)
+            for method, part in zip(methods, parts, strict=True)
+        ]
+    has_friction = [law.acts for law in laws] or [False] * len(bodies.pairs)
+    nodes = [pair.slave_nodes for pair in bodies.pairs]
 
     def linearise(u: Vector) -> ContactRows:
         parts = [
-            rows(bodies.mesh.points, u, *pair.sides, tangential=tangential)
-            if pair.rigid is None
-            else rigid_rows(
+            rows(
                 bodies.mesh.points,
                 u,
                 pair.slave,
-                pair.rigid,
-                clamped=pair.clamped,
+                pair.master if pair.rigid is None else pair.rigid,
                 tangential=tangential,
             )
             for rows, pair, tangential in zip(
                 methods, bodies.pairs, has_friction, strict=True
             )
         ]
-        if not any(part.c.size for part in parts) and not u.any():
-            raise InputError(
-                "no node of a slave side faces its master within reach; expected two "
-                "sides that face each other, each with its body on the left (in 3D, "
-                "with outward normals)"
-            )
-        if len(parts) == 1:
-            return parts[0]
-        # rows and slave nodes are numbered pair by pair
-        first_row = np.cumsum([0, *(part.c.size for part in parts)])
-        first_place = np.cumsum([0, *(pair.slave_nodes.size for pair in bodies.pairs)])
-        return ContactRows(
-            B=csr_array(vstack([part.B for part in parts])),
-            c=np.concatenate([part.c for part in parts]),
-            T=csr_array(vstack([part.T for part in parts])),
-            row=np.concatenate(
-                [p.row + k for p, k in zip(parts, first_row, strict=False)]
-            ),
-            share=np.concatenate([part.share for part in parts]),
-            place=np.concatenate(
-                [p.place + k for p, k in zip(parts, first_place, strict=False)]
-            ),
-        )
+        if not u.any():
+            for name, part in zip(pair_names(bodies), parts, strict=True):
+                if not part.c.size:
+                    raise InputError(
+                        f"contact {name}: no node of the slave side faces its master "
+                        "within reach; expected two sides that face each other, each "
+                        "with its body on the left (in 3D, with outward normals)"
+                    )
+        return parts[0] if len(parts) == 1 else joined(parts, nodes)
 
     return linearise
 
@@ -110,9 +101,9 @@ def contact_stiffness(
 ) -> Callable[[Vector, Vector], tuple[NDArray[np.float64], Nodes]]:
     """Return a function that evaluates the blocks −λ_i g_i''(u).
 
-    The arguments of this function are u (n,) in m and λ (m,) in N/m, and its result is
+    The arguments of this function are u (n,) in m and λ (s,) in N/m, and its result is
     that of `problems.contact.node_to_segment.geometric_stiffness` for all pairs.
-    Contact is node to segment, with one row per slave node.
+    Contact is node to segment, and λ has one entry per slave node.
 
     fixed_segments : see `linearisation`
     """

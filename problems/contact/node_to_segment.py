@@ -19,8 +19,7 @@ Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
 The friction forces are −Tᵀλ_t, by analogy with the contact forces −Bᵀλ.
 
-For slave nodes beyond an end of the master, the closest point is the node at this end,
-and n is the normal of the segment at this end.
+For slave nodes beyond an end of the master, see `problems.contact.rows`.
 
 A slave node can be assigned to a fixed segment. The node then stays on the outer side
 of the whole line through this segment, irrespective of its closest point. Newton's
@@ -35,10 +34,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.segment_search import nearest
+from mortarbench.problems.contact.mortar import mortar
+from mortarbench.problems.contact.rows import ContactRows, Feet, nodal_rows
+from mortarbench.problems.contact.segment_search import Reach, nearest
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
@@ -47,25 +47,10 @@ from mortarbench.problems.contact.surface import (
     tangents,
 )
 from mortarbench.problems.fem.elements import cross
-from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
+from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
 #: closest points within this distance in ξ of an end of a segment are moved to this end
 VERTEX_TOLERANCE = 1e-9
-
-
-class ContactRows(NamedTuple):
-    """Contact rows B u ≤ c for the total displacement u, and rows of the slip T u."""
-
-    B: csr_array  #: (m_I, n) B_M of eq. (5), dimensionless
-    c: Vector  #: (m_I,) c_M of eq. (5), m
-    T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row with friction
-    row: Nodes  #: (k,) contact row of each tangential row
-    #: (m_I,) ∫N_j over the slave side (for mortar contact, over its covered part, and
-    #: with the weight |ν| in 2D), the length in m (2D) or the area in m² (3D) that is
-    #: assigned to the row
-    share: Vector
-    #: (m_I,) index of the slave node of each row in `ContactPair.slave_nodes`
-    place: Nodes
 
 
 class ClosestPoints(NamedTuple):
@@ -74,8 +59,12 @@ class ClosestPoints(NamedTuple):
     #: (s,) position in the chain of the first node of the segment that contains the
     #: closest point
     segment: Nodes
-    xi: Vector  #: (s,) coordinate on the segment, 0 at its first node, 1 at its second
+    #: (s,) coordinate on the segment, 0 at its first node, 1 at its second; beyond an
+    #: end of the chain, the coordinate on the line through the last segment
+    xi: Vector
     normal: Points  #: (s, 2) outward unit normal of the master at the closest point
+    #: (s,) distance along the master by which a point is beyond its end, m; else 0
+    beyond: Vector
 
 
 def node_to_segment(
@@ -84,13 +73,14 @@ def node_to_segment(
     slave: Nodes,
     master: Nodes,
     *,
+    reach: Reach = Reach(),  # noqa: B008 - frozen
     tangential: bool = False,
     fixed_segments: Nodes | None = None,
 ) -> ContactRows:
     """Linearise the non-penetration condition of all slave nodes at u.
 
-    The result has one contact row per slave node. B, c and T are defined in the module
-    docstring.
+    The result has one contact row per slave node, except for nodes beyond an end of the
+    master. B, c and T are defined in the module docstring.
 
     Parameters
     ----------
@@ -98,6 +88,7 @@ def node_to_segment(
     u : (n,) displacement u^k at which to linearise, m
     slave : (s,) chain of nodes with its body on the left
     master : (v,) chain of nodes with its body on the left
+    reach : limits on the distance of a node and, for the side as a whole, on the angle
     tangential : add tangential rows for friction
     fixed_segments : (s,) fixed segment of each slave node, given by the position of its
         first node in the master chain; −1 selects the closest segment
@@ -108,27 +99,39 @@ def node_to_segment(
         If a position is not finite or the master has no segment of positive length.
 
     """
-    x = current_positions(points, u, slave, "slave")
-    line = current_surface(points, u, master, "master")
-    closest = _projections(x, line, fixed_segments)
+    side, line = (
+        current_surface(points, u, chain, name)
+        for chain, name in ((slave, "slave"), (master, "master"))
+    )
+    closest = _projections(side.x, line, fixed_segments)
     N = np.stack([1 - closest.xi, closest.xi], axis=1)
     ends = np.stack([closest.segment, closest.segment + 1], axis=1)
     foot = np.einsum("sa,sax->sx", N, line.x[ends])
-    gap = np.einsum("sx,sx->s", x - foot, closest.normal)
-
-    # (m, 3) stencil of each row: the slave node and both ends of the segment
-    node = np.column_stack([slave, master[ends]])
-    weight = np.column_stack([-np.ones(len(slave)), N])
-    B = rows_along(node, weight, closest.normal, points.size)
-    # friction rows have the weights of their contact row, along the tangents
-    T, row = csr_array((0, points.size)), np.arange(0)
-    if tangential:
-        directions = tangents(closest.normal)
-        row = np.repeat(np.arange(slave.size), directions.shape[1])
-        along = directions.reshape(-1, points.shape[1])
-        T = rows_along(node[row], weight[row], along, points.size)
-    place = np.arange(slave.size)
-    return ContactRows(B, gap + B @ u, T, row, nodal_lengths(x), place)
+    return nodal_rows(
+        u,
+        slave,
+        side,
+        Feet(
+            master[ends],
+            N,
+            foot,
+            closest.normal,
+            closest.beyond,
+            np.linalg.norm(line.x[ends[:, 1]] - line.x[ends[:, 0]], axis=1) / 2,
+        ),
+        (reach.max_distance(side, line), reach.cosine),
+        lambda part: mortar(
+            points,
+            u,
+            slave,
+            master,
+            basis="standard",
+            part=part,
+            reach=reach,
+            tangential=tangential,
+        ),
+        tangential=tangential,
+    )
 
 
 def geometric_stiffness(
@@ -202,7 +205,24 @@ def closest_points(x: Points, line: Surface) -> ClosestPoints:
     xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
     normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
     normal = np.where(at_second[:, None], line.node_normal[second], normal)
-    return ClosestPoints(first, xi, normal)
+    along, length = _along(x, line, first)
+    starts = at_first & (segment == 0)
+    ends = at_second & (segment == len(line.facets) - 1)
+    excess = np.where(starts, -along, np.where(ends, along - 1, 0.0))
+    excess = np.where(excess > VERTEX_TOLERANCE, excess, 0.0)
+    xi = np.where(excess > 0, along, xi)
+    return ClosestPoints(first, xi, normal, excess * length)
+
+
+def _along(x: Points, line: Surface, segment: Nodes) -> tuple[Vector, Vector]:
+    """Project x (s, 2) onto the lines through segments; return ξ and the lengths.
+
+    segment : (s,) position in the chain of the first node of each segment
+    """
+    edge = line.x[segment + 1] - line.x[segment]
+    square = np.einsum("sx,sx->s", edge, edge)
+    xi = np.einsum("sx,sx->s", x - line.x[segment], edge) / square
+    return np.asarray(xi), np.sqrt(square)
 
 
 def _projections(
@@ -217,30 +237,12 @@ def _projections(
     if fixed_segments is None or not (is_fixed := fixed_segments >= 0).any():
         return closest
     segment = np.where(is_fixed, fixed_segments, closest.segment)
-    start = line.x[segment]
-    edge = line.x[segment + 1] - start
-    xi = np.einsum("sx,sx->s", x - start, edge) / np.einsum("sx,sx->s", edge, edge)
-    length = np.linalg.norm(edge, axis=1)[:, None]
-    across = -tangents(edge)[:, 0] / length
+    xi, length = _along(x, line, segment)
+    edge = line.x[segment + 1] - line.x[segment]
+    across = -tangents(edge)[:, 0] / length[:, None]
     return ClosestPoints(
         segment,
         np.where(is_fixed, xi, closest.xi),
         np.where(is_fixed[:, None], across, closest.normal),
+        np.where(is_fixed, 0.0, closest.beyond),
     )
-
-
-def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:
-    """Assemble rows of weighted displacements along a direction, (m, size).
-
-    Row r has the entries weight_ra · direction_r at the components of node_ra, for
-    `node` and `weight` (m, k) and `direction` (m, dim). Zeros are not stored.
-    """
-    (m, k), dim = node.shape, direction.shape[1]
-    if not m:
-        return csr_array((0, size))
-    values = weight[:, :, None] * direction[:, None, :]
-    indptr = dim * k * np.arange(m + 1)
-    B = csr_array((values.ravel(), dofs_of(node, dim), indptr), shape=(m, size))
-    B.sum_duplicates()
-    B.eliminate_zeros()
-    return B

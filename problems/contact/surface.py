@@ -6,7 +6,7 @@ cells.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,21 @@ class Surface:
         if self.x.shape[1] == 2:
             return nodal_lengths(self.x)
         return nodal_areas(self.x, self.facets)[1]
+
+    def areas_in(self, part: NDArray[np.bool_]) -> Vector:
+        """Return ∫N_j (v,) over the facets in a mask (f,); see `areas`."""
+        areas = np.zeros(len(self.x))
+        if self.x.shape[1] == 2:
+            half = np.linalg.norm(self.end - self.start, axis=1)[part] / 2
+            np.add.at(areas, self.facets[part], half[:, None])
+        else:
+            nodes, values = nodal_areas(self.x, self.facets[part])
+            areas[nodes] = values
+        return areas
+
+    def part(self, facets: NDArray[np.bool_]) -> Surface:
+        """Return the facets in a mask (f,), with the nodes and normals of the side."""
+        return replace(self, facets=self.facets[facets], normal=self.normal[facets])
 
     @property
     def extent(self) -> float:

@@ -25,6 +25,7 @@ from mortarbench.harness import (
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality.decomposed import cached_layout, decompose
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise, primal_form
 from mortarbench.problems.duality.feti_dual import (
@@ -76,14 +77,15 @@ def case_of(
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
-        solution = MonolithicSolution(
-            InterfaceState(bodies, primal, s, friction), bodies, count
-        )
-        return {**quantities(bodies, primal, s, friction), **problem.results(solution)}
+        state = InterfaceState(bodies, primal, s, whole.rows, friction)
+        solution = MonolithicSolution(state, bodies, count)
+        values = quantities(bodies, primal, s, whole.rows, friction)
+        return {**values, **problem.results(solution)}
 
     case = contact_case(
         bodies,
         primal,
+        whole.rows,
         form,
         parts=decomposed,
         floating=lambda: elastic.floating,
@@ -138,6 +140,7 @@ class MonolithicSolution:
 def contact_case(
     bodies: Bodies,
     primal: QP,
+    rows: ContactRows,
     form: str,
     *,
     floating: Factorise,
@@ -151,6 +154,7 @@ def contact_case(
 
     Parameters
     ----------
+    rows : contact rows of `primal`
     floating : function that factorises K and returns K⁺ with the rigid modes as kernel;
         called only for the form `dual`
     clamped : function that returns K⁺ with the fixed components eliminated; called only
@@ -193,7 +197,12 @@ def contact_case(
         recover=lambda s: transformed.recover(s).x * bodies.length,
         quantities=lambda s: {**quantities(transformed.recover(s)), **decomposition},
         fields=lambda s: fields(
-            bodies, primal, transformed.recover(s), friction, subdomains=subdomains
+            bodies,
+            primal,
+            transformed.recover(s),
+            rows,
+            friction,
+            subdomains=subdomains,
         ),
         scale=transformed.sign * energy,
         constant=transformed.constant * energy,

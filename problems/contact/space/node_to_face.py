@@ -7,7 +7,8 @@ B = [−n at s, +N_a n at a] and c = g + B u^k.
 
 The closest point is determined on the triangles of the faces
 (`problems.contact.space.triangles`). The normal n is that of the face; at an edge or a
-corner where several faces meet, their normals are averaged.
+corner where several faces meet, their normals are averaged. For
+slave nodes beyond the border of the master, see `problems.contact.rows`.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.node_to_segment import ContactRows, rows_along
+from mortarbench.problems.contact.rows import ContactRows, Feet, nodal_rows
+from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.space.face_mortar import face_mortar
 from mortarbench.problems.contact.space.triangles import FaceTriangles, triangulated
-from mortarbench.problems.contact.surface import Points, current_surface, tangents
+from mortarbench.problems.contact.surface import Points, current_surface
 from mortarbench.problems.fem.mesh import Nodes
 
 #: the closest points on two faces are the same point of a common edge if their
@@ -34,8 +36,12 @@ class ClosestPoints(NamedTuple):
     """Closest points of s positions on faces."""
 
     face: Nodes  #: (s,) face that contains the closest point
-    N: NDArray[np.float64]  #: (s, 4) shape functions of the face at the closest point
+    #: (s, 4) shape functions of the face at the closest point; beyond the border, at
+    #: the foot on the plane of the nearest triangle
+    N: NDArray[np.float64]
     normal: Points  #: (s, 3) outward unit normal of the master at the closest point
+    #: (s,) distance along the master by which a point is beyond its border, m; else 0
+    beyond: Vector
 
 
 def node_to_face(
@@ -44,6 +50,7 @@ def node_to_face(
     slave: Nodes,
     master: Nodes,
     *,
+    reach: Reach = Reach(),  # noqa: B008 - frozen
     tangential: bool = False,
 ) -> ContactRows:
     """Linearise the non-penetration condition of all slave nodes at u.
@@ -53,11 +60,13 @@ def node_to_face(
     points : (N, 3) reference positions X, m
     u : (3N,) displacement u^k at which to linearise, m
     slave, master : (f, 4), (g, 4) faces of both sides, boundaries of a `Mesh`
+    reach : limits on the distance of a node and, for the side as a whole, on the angle
     tangential : add two tangential rows per contact row
 
     Returns
     -------
-    one contact row per slave node, in ascending order of their numbers
+    one contact row per slave node, in ascending order of their numbers, except for
+    nodes beyond the border of the master
 
     Raises
     ------
@@ -70,19 +79,34 @@ def node_to_face(
         current_surface(points, u, faces, name)
         for faces, name in ((slave, "slave"), (master, "master"))
     )
-    x, closest = side.x, closest_points(side.x, triangulated(other))
+    faces = triangulated(other)
+    closest = closest_points(side.x, faces)
     at = other.facets[closest.face]
-    gap = np.einsum("sx,sx->s", x, closest.normal)
-    gap -= np.einsum("sa,sax,sx->s", closest.N, other.x[at], closest.normal)
-    node = np.column_stack([own, nodes[at]])
-    weight = np.column_stack([-np.ones(own.size), closest.N])
-    B = rows_along(node, weight, closest.normal, points.size)
-    T, row = csr_array((0, points.size)), np.arange(0)
-    if tangential:
-        row = np.repeat(np.arange(own.size), 2)
-        along = tangents(closest.normal).reshape(-1, 3)
-        T = rows_along(node[row], weight[row], along, points.size)
-    return ContactRows(B, gap + B @ u, T, row, side.areas, np.arange(own.size))
+    return nodal_rows(
+        u,
+        own,
+        side,
+        Feet(
+            nodes[at],
+            closest.N,
+            np.einsum("sa,sax->sx", closest.N, other.x[at]),
+            closest.normal,
+            closest.beyond,
+            faces.radius[closest.face],
+        ),
+        (reach.max_distance(side, other), reach.cosine),
+        lambda part: face_mortar(
+            points,
+            u,
+            slave,
+            master,
+            basis="standard",
+            part=part,
+            reach=reach,
+            tangential=tangential,
+        ),
+        tangential=tangential,
+    )
 
 
 def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
@@ -97,6 +121,7 @@ def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
     candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
     t, pair = faces.of_faces(candidate)
     node = np.repeat(np.arange(len(x)), [len(k) for k in found])[pair]
+    border = faces.border[t]
     barycentric = closest_in_triangles(x[node], faces.vertices[t])
     at = np.einsum("pv,pvx->px", barycentric, faces.vertices[t])
     distance = np.linalg.norm(at - x[node], axis=1)
@@ -113,8 +138,37 @@ def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
     normal = np.where(
         size > 0, total / np.where(size > 0, size, 1), faces.surface.normal[face]
     )
-    N = np.einsum("sv,svc->sc", barycentric[best], faces.shape[t[best]])
-    return ClosestPoints(face, N, normal)
+    # components of x − x_c outwards, along the faces whose border contains x_c
+    edges = np.roll(faces.vertices[t], -1, axis=1) - faces.vertices[t]
+    across = np.cross(edges[:, 0], edges[:, 1])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    outwards = np.cross(edges, across[:, None])
+    outwards /= np.linalg.norm(outwards, axis=2, keepdims=True)
+    on_border = border & (np.roll(barycentric, -2, axis=1) <= 0) & meets[:, None]
+    excess = np.einsum("pkx,px->pk", outwards, x[node] - at)
+    excess[~on_border | (excess <= SAME_POINT * faces.radius[faces.face[t], None])] = 0
+    beyond = np.zeros(len(x))
+    np.maximum.at(beyond, node, excess.max(axis=1))
+    # beyond the border, the face is extended
+    outside, weight = (beyond > 0)[:, None], barycentric[best]
+    weight = np.where(outside, feet_in_planes(x, faces.vertices[t[best]]), weight)
+    normal = np.where(outside, across[best], normal)
+    N = np.einsum("sv,svc->sc", weight, faces.shape[t[best]])
+    return ClosestPoints(face, N, normal, beyond)
+
+
+def feet_in_planes(x: Points, triangle: Points) -> NDArray[np.float64]:
+    """Return barycentric coordinates (p, 3) of the projections of x (p, 3).
+
+    triangle : (p, 3, 3) vertices
+    """
+    edges = np.roll(triangle, -1, axis=1) - triangle  # edge k from vertex k to k + 1
+    offset = x[:, None] - triangle
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    square = np.einsum("px,px->p", normal, normal)[:, None]
+    # the barycentric coordinate of vertex k + 2 is the area over edge k
+    parts = np.einsum("pkx,px->pk", np.cross(edges, offset), normal) / square
+    return np.roll(parts, 2, axis=1)
 
 
 def closest_in_triangles(x: Points, triangle: Points) -> NDArray[np.float64]:
@@ -127,11 +181,7 @@ def closest_in_triangles(x: Points, triangle: Points) -> NDArray[np.float64]:
     """
     edges = np.roll(triangle, -1, axis=1) - triangle  # edge k from vertex k to k + 1
     offset = x[:, None] - triangle
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    square = np.einsum("px,px->p", normal, normal)[:, None]
-    # the barycentric coordinate of vertex k + 2 is the area over edge k
-    parts = np.einsum("pkx,px->pk", np.cross(edges, offset), normal) / square
-    foot = np.roll(parts, 2, axis=1)
+    foot = feet_in_planes(x, triangle)
     length = np.einsum("pkx,pkx->pk", edges, edges)
     along = np.clip(np.einsum("pkx,pkx->pk", offset, edges) / length, 0.0, 1.0)
     away = offset - along[..., None] * edges
@@ -139,4 +189,5 @@ def closest_in_triangles(x: Points, triangle: Points) -> NDArray[np.float64]:
     p = np.arange(len(x))
     on_edge = np.zeros((len(x), 3))
     on_edge[p, k], on_edge[p, (k + 1) % 3] = 1 - along[p, k], along[p, k]
-    return np.where((foot >= 0).all(axis=1)[:, None], foot, on_edge)
+    inside = np.asarray((foot >= 0).all(axis=1))
+    return np.where(inside[:, None], foot, on_edge)

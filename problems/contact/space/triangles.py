@@ -39,6 +39,18 @@ class FaceTriangles(NamedTuple):
     shape: NDArray[np.float64]
     vertices: Points  #: (t, 3, 3) positions of the vertices, m
 
+    @property
+    def border(self) -> NDArray[np.bool_]:
+        """Mask (t, 3) of the edges from vertex k to k + 1 that bound a single face."""
+        facets = self.surface.facets
+        node = np.take_along_axis(facets[self.face], self.shape.argmax(axis=2), axis=1)
+        node[self.shape.max(axis=2) < 1] = -1  # the centre of a quadrilateral
+        low, high = np.sort(np.stack([node, np.roll(node, -1, axis=1)]), axis=0)
+        edge = low * len(self.surface.x) + high
+        _, place, count = np.unique(edge, return_inverse=True, return_counts=True)
+        once = (count == 1)[place].reshape(edge.shape)
+        return np.asarray(once & (low >= 0))
+
     def of_faces(self, faces: Nodes) -> tuple[Nodes, Nodes]:
         """Return the triangles (k,) of the given faces (p,).
 

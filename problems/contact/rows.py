@@ -1,0 +1,309 @@
+"""Contact rows B u ≤ c of one or several pairs of sides, and operations on them.
+
+Every slave node has at most one row per pair. If several pairs have the same row at a
+common slave node, such as where two named parts of a side meet, this row has a single
+multiplier, and its force is divided among the pairs in proportion to the areas by which
+they cover the node.
+
+*Border of the master.* The row of a slave node acts between the node and its closest
+point on the master. If the node is beyond the border of the master, the line between
+the two points is not normal to the master, and the forces of such a row would have a
+moment. Two rules keep the forces in equilibrium:
+
+- Up to `EXTENSION` beyond the border, the node is opposite the extended plane of the
+  master's last facet (as in the extension zone of Abaqus).
+- If a facet of the slave has a node farther beyond, the rows of its nodes contain the
+  integral over the part of the facet that the master covers. With the basis N_j of
+  mortar contact, the row of node j is
+
+      Σ_e ∫_e N_j g  ≥  0,   where  ∫_e N_j g ≈ g_j ∫_e N_j  on all other facets.
+
+A node beyond the border by more than the radius of its facets (half the length of a
+segment, or the distance of the corners of a face from its centre) has no row, because
+its row would hardly differ from that of its neighbour. In the integrals, its N_j is
+added to those of the nodes with a row in its facets, so that the functions of all rows
+sum to one, and the areas of all rows to the covered area.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
+
+from mortarbench.harness import Vector
+from mortarbench.problems.contact.surface import Points, Surface, tangents
+from mortarbench.problems.fem.mesh import Nodes, dofs_of
+
+#: distance by which a slave node may be beyond the border of its master and still have
+#: a nodal row, relative to the smaller radius of a facet of both sides: a tenth of the
+#: length of a segment, the default of Abaqus
+EXTENSION = 0.2
+#: two rows of a slave node whose entries differ by at most this value are the same row
+SAME_ROW = 1e-9
+#: entries of a row at free components whose sum is at most this fraction of the sum of
+#: all entries count as rounding errors of the normal
+MIN_FREE = 1e-12
+
+
+class ContactRows(NamedTuple):
+    """Contact rows B u ≤ c for the total displacement u, and rows of the slip T u.
+
+    The last four arrays have one entry for each slave node with a row (for each pair).
+    """
+
+    B: csr_array  #: (m, n) B_M of eq. (5), dimensionless
+    c: Vector  #: (m,) c_M of eq. (5), m
+    T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row with friction
+    row: Nodes  #: (k,) contact row of each tangential row
+    #: (e,) ∫N_j over the slave side (for mortar contact, over its covered part, and
+    #: with the weight |ν| in 2D), the length in m (2D) or the area in m² (3D) that is
+    #: assigned to the row
+    share: Vector
+    #: (e,) index of the slave node in `ContactPair.slave_nodes`; with several pairs, in
+    #: the concatenation of these arrays
+    place: Nodes
+    #: (e,) fraction of the node's length or area that is opposite the master
+    covered: Vector
+    at: Nodes  #: (e,) contact row of each entry
+
+    def of_rows(self, values: Vector) -> Vector:
+        """Return the sums (m,) over the slave nodes of each row.
+
+        values : (e,) value of each entry
+        """
+        return np.bincount(self.at, values, minlength=self.c.size).astype(float)
+
+    def at_places(self, force: Vector, places: int) -> Vector:
+        """Return the force (places,) of each slave node; zero if it has no row.
+
+        force : (m,) force of each row, which is divided in proportion to `share`
+        """
+        at_place = np.zeros(places)
+        share = self.share / self.of_rows(self.share)[self.at]
+        at_place[self.place] = force[self.at] * share
+        return at_place
+
+    def selected(self, keep: NDArray[np.bool_]) -> ContactRows:
+        """Return the rows in a mask (m,), with their tangential rows and entries."""
+        number = np.cumsum(keep) - 1
+        slips, entries = keep[self.row], keep[self.at]
+        return ContactRows(
+            self.B[keep],
+            self.c[keep],
+            self.T[slips],
+            number[self.row[slips]],
+            self.share[entries],
+            self.place[entries],
+            self.covered[entries],
+            number[self.at[entries]],
+        )
+
+
+class Feet(NamedTuple):
+    """Closest points of all s slave nodes on the master, which may be extended."""
+
+    node: Nodes  #: (s, a) nodes of the master facet with the closest point
+    #: (s, a) shape functions of these nodes at this point; extrapolated beyond a border
+    N: NDArray[np.float64]
+    x: Points  #: (s, dim) position, m
+    normal: Points  #: (s, dim) outward unit normal of the master
+    #: (s,) distance along the master by which a node is beyond its border, m; else 0
+    beyond: Vector
+    radius: Vector  #: (s,) radius of the master facet, m
+
+
+#: function that returns the mortar rows, with the basis N_j, of the slave facets in a
+#: mask (f,)
+Integral = Callable[[NDArray[np.bool_]], ContactRows]
+
+
+def nodal_rows(
+    u: Vector,
+    slave: Nodes,
+    side: Surface,
+    feet: Feet,
+    limits: tuple[float, float],
+    integral: Integral,
+    *,
+    tangential: bool,
+) -> ContactRows:
+    """Return one row per slave node, except for nodes beyond the border of the master.
+
+    Parameters
+    ----------
+    u : (n,) displacement u^k at which to linearise, m
+    slave : (s,) slave nodes
+    side : slave side at X + u^k
+    limits : largest distance of a node from its closest point, m, and largest cosine
+        between the normals of both sides there. If no node is within both limits, the
+        side does not face the master, and has no row
+    tangential : add tangential rows for friction
+
+    """
+    s, dim = side.x.shape
+    offset = side.x - feet.x
+    gap = np.einsum("sx,sx->s", offset, feet.normal)
+    # stencil of each row: the slave node and the nodes of the master facet
+    node = np.column_stack([slave, feet.node])
+    weight = np.column_stack([-np.ones(s), feet.N])
+    B = rows_along(node, weight, feet.normal, u.size)
+    # friction rows have the weights of their contact row, along the tangents
+    along = tangents(feet.normal)[: s if tangential else 0]
+    row, every = np.repeat(np.arange(len(along)), dim - 1), np.arange(s)
+    T = rows_along(node[row], weight[row], along.reshape(-1, dim), u.size)
+    rows = ContactRows(B, gap + B @ u, T, row, side.areas, every, np.ones(s), every)
+    near = np.linalg.norm(offset, axis=1) <= limits[0]
+    cosine = np.einsum("sx,sx->s", side.node_normal, feet.normal)
+    if not (near & (cosine <= limits[1])).any():
+        near[:] = False
+    corners = side.x[side.facets]
+    radius = np.zeros(s)
+    size = np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=2)
+    np.maximum.at(radius, side.facets, size)
+    outside = feet.beyond > EXTENSION * np.minimum(radius, feet.radius)
+    if not (near & outside).any():
+        return rows.selected(near)
+    own = near & (feet.beyond <= radius)
+    return _with_integrals(rows, side, outside, near & ~outside, own, integral)
+
+
+def _with_integrals(
+    nodal: ContactRows,
+    side: Surface,
+    outside: NDArray[np.bool_],
+    inside: NDArray[np.bool_],
+    near: NDArray[np.bool_],
+    integral: Integral,
+) -> ContactRows:
+    """Integrate over the slave facets with a node beyond the border of the master.
+
+    Parameters
+    ----------
+    nodal : rows of all slave nodes
+    outside : (s,) mask of the nodes beyond the border
+    inside : (s,) mask of the nodes that keep a row
+    near : (s,) mask of the nodes that have a row if the master covers their facets
+
+    """
+    s, facets, areas = nodal.c.size, side.facets, side.areas
+    cut = np.asarray(outside[facets].any(axis=1))
+    part = integral(cut)
+    # area of each node in the covered parts of these facets, and in all other facets
+    covered, whole = np.zeros(s), areas.copy()
+    covered[part.place] = part.covered * areas[part.place]
+    bordered = np.unique(facets[cut])
+    whole[bordered] = side.areas_in(~cut)[bordered]
+    alone = inside & (whole + covered == 0)  # at an angle at which nothing is covered
+    whole[alone] = areas[alone]
+    kept = inside | (near & (covered > 0))
+    # E (s, s) gives the area of a node without a row to the nodes with a row in its
+    # facets
+    i = np.repeat(facets[cut], facets.shape[1], axis=1).ravel()
+    j = np.tile(facets[cut], (1, facets.shape[1])).ravel()
+    given = kept[i] & ~kept[j]
+    E = csr_array((np.ones(given.sum()), (i[given], j[given])), shape=(s, s))
+    E.data[:] = 1.0
+    E.data /= np.bincount(E.indices, minlength=s)[E.indices]
+    E = csr_array(E + diags_array(kept.astype(float)))
+    # the rows are V · nodal + W · part, with weights that sum to one
+    W = csr_array(E[:, part.place] @ diags_array(part.share))
+    total = np.where(kept, whole * inside + W.sum(axis=1), 1.0)
+    W = csr_array(diags_array(kept / total) @ W)
+    V = diags_array(inside * whole / total)
+    one = eye_array(nodal.T.shape[0] // s)
+    area = inside * whole + E @ covered
+    return ContactRows(
+        B=csr_array(V @ nodal.B + W @ part.B),
+        c=V @ nodal.c + W @ part.c,
+        T=csr_array(kron(V, one) @ nodal.T + kron(W, one) @ part.T),
+        row=nodal.row,
+        share=area,
+        place=nodal.place,
+        covered=area / areas,
+        at=nodal.at,
+    ).selected(kept)
+
+
+def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:
+    """Assemble rows of weighted displacements along a direction, (m, size).
+
+    Row r has the entries weight_ra · direction_r at the components of node_ra, for
+    `node` and `weight` (m, k) and `direction` (m, dim). Zeros are not stored.
+    """
+    (m, k), dim = node.shape, direction.shape[1]
+    if not m:
+        return csr_array((0, size))
+    values = weight[:, :, None] * direction[:, None, :]
+    indptr = dim * k * np.arange(m + 1)
+    B = csr_array((values.ravel(), dofs_of(node, dim), indptr), shape=(m, size))
+    B.sum_duplicates()
+    B.eliminate_zeros()
+    return B
+
+
+def joined(parts: Sequence[ContactRows], nodes: Sequence[Nodes]) -> ContactRows:
+    """Join the rows of several pairs; equal rows of a common slave node become one.
+
+    nodes : slave nodes of each pair
+    """
+    first_row = np.cumsum([0, *(part.c.size for part in parts)])
+    first_place = np.cumsum([0, *(one.size for one in nodes)])
+
+    def numbered(name: str, first: Nodes) -> Nodes:
+        values = (getattr(p, name) + k for p, k in zip(parts, first, strict=False))
+        return np.concatenate(list(values))
+
+    rows = ContactRows(
+        B=csr_array(vstack([part.B for part in parts])),
+        c=np.concatenate([part.c for part in parts]),
+        T=csr_array(vstack([part.T for part in parts])),
+        row=numbered("row", first_row),
+        share=np.concatenate([part.share for part in parts]),
+        place=numbered("place", first_place),
+        covered=np.concatenate([part.covered for part in parts]),
+        at=numbered("at", first_row),
+    )
+    # sort by slave node, so that rows of a common node follow each other
+    node = np.concatenate(list(nodes))[rows.place]
+    order = np.argsort(node, kind="stable")
+    before, after = rows.at[order[:-1]], rows.at[order[1:]]
+    common = np.flatnonzero(node[order[:-1]] == node[order[1:]])
+    i, j = before[common], after[common]
+    slips = np.isin(np.arange(rows.c.size), rows.row)
+    same = np.full(common.size, False)
+    if common.size:
+        same = abs(rows.B[i] - rows.B[j]).max(axis=1).toarray().ravel() <= SAME_ROW
+        same &= slips[i] == slips[j]  # otherwise the friction of one would be lost
+    leader = np.arange(rows.c.size)
+    for first, second in zip(i[same], j[same], strict=True):
+        leader[second] = leader[first]
+    keep = leader == np.arange(leader.size)
+    return rows._replace(at=leader[rows.at]).selected(keep)
+
+
+def without_fixed(rows: ContactRows, fixed: Nodes) -> ContactRows:
+    """Return the rows with an entry at a free component.
+
+    If supports prescribe all components of a row, its multiplier is a force between
+    supports, which no equation determines. The same holds for the tangential rows of a
+    node, which are dropped together.
+
+    fixed : components that supports prescribe
+    """
+    free = np.ones(rows.B.shape[1])
+    free[fixed] = 0.0
+    keep = _acts(rows.B, free)
+    slips = np.zeros(rows.c.size, dtype=bool)
+    slips[rows.row[_acts(rows.T, free)]] = True
+    slips = slips[rows.row]
+    return rows._replace(T=rows.T[slips], row=rows.row[slips]).selected(keep)
+
+
+def _acts(rows: csr_array, free: Vector) -> NDArray[np.bool_]:
+    """Return a mask (m,) of the rows with entries at free components (n,)."""
+    size = abs(rows)
+    return np.asarray(size @ free > MIN_FREE * (size @ np.ones_like(free)))
