@@ -14,13 +14,12 @@ from mortarbench.problems.contact.bodies import Bodies, ContactSides, Unassemble
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_segment import (
-    closest_points,
     geometric_stiffness,
     node_to_segment,
 )
 from mortarbench.problems.contact.rigid import rigid_rows
 from mortarbench.problems.contact.rows import ContactRows, joined
-from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.segment_search import Reach, closest_points
 from mortarbench.problems.contact.sides import pair_names
 from mortarbench.problems.contact.space.face_mortar import face_mortar
 from mortarbench.problems.contact.space.node_to_face import node_to_face

@@ -30,15 +30,18 @@ between iterations.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.rows import ContactRows, Feet, nodal_rows
-from mortarbench.problems.contact.segment_search import Reach, nearest
+from mortarbench.problems.contact.segment_search import (
+    ClosestPoints,
+    Reach,
+    along_lines,
+    closest_points,
+)
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
@@ -48,23 +51,6 @@ from mortarbench.problems.contact.surface import (
 )
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
-
-#: closest points within this distance in ξ of an end of a segment are moved to this end
-VERTEX_TOLERANCE = 1e-9
-
-
-class ClosestPoints(NamedTuple):
-    """Closest points of s positions on a chain of nodes."""
-
-    #: (s,) position in the chain of the first node of the segment that contains the
-    #: closest point
-    segment: Nodes
-    #: (s,) coordinate on the segment, 0 at its first node, 1 at its second; beyond an
-    #: end of the chain, the coordinate on the line through the last segment
-    xi: Vector
-    normal: Points  #: (s, 2) outward unit normal of the master at the closest point
-    #: (s,) distance along the master by which a point is beyond its end, m; else 0
-    beyond: Vector
 
 
 def node_to_segment(
@@ -196,53 +182,30 @@ def geometric_stiffness(
     return blocks, dofs_of(nodes, 2).reshape(-1, 6)
 
 
-def closest_points(x: Points, line: Surface) -> ClosestPoints:
-    """Return the closest points of x (s, 2) on a chain, with outward normals."""
-    segment, xi = nearest(x, line)
-    first, second = line.facets.T[:, segment]
-    # snap to vertices, where the normal is averaged: rounding must not select a segment
-    at_first, at_second = xi <= VERTEX_TOLERANCE, xi >= 1 - VERTEX_TOLERANCE
-    xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
-    normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
-    normal = np.where(at_second[:, None], line.node_normal[second], normal)
-    along, length = _along(x, line, first)
-    starts = at_first & (segment == 0)
-    ends = at_second & (segment == len(line.facets) - 1)
-    excess = np.where(starts, -along, np.where(ends, along - 1, 0.0))
-    excess = np.where(excess > VERTEX_TOLERANCE, excess, 0.0)
-    xi = np.where(excess > 0, along, xi)
-    return ClosestPoints(first, xi, normal, excess * length)
-
-
-def _along(x: Points, line: Surface, segment: Nodes) -> tuple[Vector, Vector]:
-    """Project x (s, 2) onto the lines through segments; return ξ and the lengths.
-
-    segment : (s,) position in the chain of the first node of each segment
-    """
-    edge = line.x[segment + 1] - line.x[segment]
-    square = np.einsum("sx,sx->s", edge, edge)
-    xi = np.einsum("sx,sx->s", x - line.x[segment], edge) / square
-    return np.asarray(xi), np.sqrt(square)
-
-
 def _projections(
     x: Points, line: Surface, fixed_segments: Nodes | None
 ) -> ClosestPoints:
-    """Return closest points of slave nodes x (s, 2) on the master.
+    """Return closest points of slave nodes x (s, 2) on the master, possibly extended.
 
-    A node with a fixed segment is projected onto the line through this segment, where ξ
-    may be outside [0, 1].
+    A node with a fixed segment, or beyond an end of the master, is projected onto the
+    line through its segment, where ξ may be outside [0, 1].
     """
     closest = closest_points(x, line)
-    if fixed_segments is None or not (is_fixed := fixed_segments >= 0).any():
+    segment, beyond = closest.segment, closest.beyond
+    extended = beyond > 0
+    if fixed_segments is not None:
+        is_fixed = fixed_segments >= 0
+        segment = np.where(is_fixed, fixed_segments, segment)
+        beyond = np.where(is_fixed, 0.0, beyond)
+        extended |= is_fixed
+    if not extended.any():
         return closest
-    segment = np.where(is_fixed, fixed_segments, closest.segment)
-    xi, length = _along(x, line, segment)
+    xi, length = along_lines(x, line, segment)
     edge = line.x[segment + 1] - line.x[segment]
     across = -tangents(edge)[:, 0] / length[:, None]
     return ClosestPoints(
         segment,
-        np.where(is_fixed, xi, closest.xi),
-        np.where(is_fixed[:, None], across, closest.normal),
-        np.where(is_fixed, 0.0, closest.beyond),
+        np.where(extended, xi, closest.xi),
+        np.where(extended[:, None], across, closest.normal),
+        beyond,
     )

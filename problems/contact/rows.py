@@ -160,15 +160,10 @@ def nodal_rows(
     cosine = np.einsum("sx,sx->s", side.node_normal, feet.normal)
     if not (near & (cosine <= limits[1])).any():
         near[:] = False
-    corners = side.x[side.facets]
-    radius = np.zeros(s)
-    size = np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=2)
-    np.maximum.at(radius, side.facets, size)
-    outside = feet.beyond > EXTENSION * np.minimum(radius, feet.radius)
+    outside = feet.beyond > EXTENSION * np.minimum(side.radius, feet.radius)
     if not (near & outside).any():
         return rows.selected(near)
-    own = near & (feet.beyond <= radius)
-    return _with_integrals(rows, side, outside, near & ~outside, own, integral)
+    return _with_integrals(rows, side, outside, near & ~outside, integral)
 
 
 def _with_integrals(
@@ -176,7 +171,6 @@ def _with_integrals(
     side: Surface,
     outside: NDArray[np.bool_],
     inside: NDArray[np.bool_],
-    near: NDArray[np.bool_],
     integral: Integral,
 ) -> ContactRows:
     """Integrate over the slave facets with a node beyond the border of the master.
@@ -186,36 +180,28 @@ def _with_integrals(
     nodal : rows of all slave nodes
     outside : (s,) mask of the nodes beyond the border
     inside : (s,) mask of the nodes that keep a row
-    near : (s,) mask of the nodes that have a row if the master covers their facets
 
     """
-    s, facets, areas = nodal.c.size, side.facets, side.areas
-    cut = np.asarray(outside[facets].any(axis=1))
-    part = integral(cut)
-    # area of each node in the covered parts of these facets, and in all other facets
-    covered, whole = np.zeros(s), areas.copy()
-    covered[part.place] = part.covered * areas[part.place]
-    bordered = np.unique(facets[cut])
+    s, areas = nodal.c.size, side.areas
+    cut = np.asarray(outside[side.facets].any(axis=1))
+    part, whole = integral(cut), areas.copy()
+    bordered = np.unique(side.facets[cut])
     whole[bordered] = side.areas_in(~cut)[bordered]
-    alone = inside & (whole + covered == 0)  # at an angle at which nothing is covered
+    whole[~inside] = 0.0
+    covered = np.zeros((2, s))  # ∫N_j on the cut facets, as in `share` and in `covered`
+    covered[:, part.place] = part.share, part.covered * areas[part.place]
+    # a node whose facets are covered only at an angle beyond that of the integrals
+    alone = inside & (whole + covered[0] == 0)
     whole[alone] = areas[alone]
-    kept = inside | (near & (covered > 0))
-    # E (s, s) gives the area of a node without a row to the nodes with a row in its
-    # facets
-    i = np.repeat(facets[cut], facets.shape[1], axis=1).ravel()
-    j = np.tile(facets[cut], (1, facets.shape[1])).ravel()
-    given = kept[i] & ~kept[j]
-    E = csr_array((np.ones(given.sum()), (i[given], j[given])), shape=(s, s))
-    E.data[:] = 1.0
-    E.data /= np.bincount(E.indices, minlength=s)[E.indices]
-    E = csr_array(E + diags_array(kept.astype(float)))
     # the rows are V · nodal + W · part, with weights that sum to one
-    W = csr_array(E[:, part.place] @ diags_array(part.share))
-    total = np.where(kept, whole * inside + W.sum(axis=1), 1.0)
-    W = csr_array(diags_array(kept / total) @ W)
-    V = diags_array(inside * whole / total)
+    kept = whole + covered[0] > 0
+    total = np.where(kept, whole + covered[0], 1.0)
+    V = diags_array(whole / total)
+    weight = part.share / total[part.place]
+    shape = (s, part.place.size)
+    W = csr_array((weight, (part.place, np.arange(part.place.size))), shape=shape)
     one = eye_array(nodal.T.shape[0] // s)
-    area = inside * whole + E @ covered
+    area = whole + covered[1]
     return ContactRows(
         B=csr_array(V @ nodal.B + W @ part.B),
         c=V @ nodal.c + W @ part.c,
@@ -226,6 +212,44 @@ def _with_integrals(
         covered=area / areas,
         at=nodal.at,
     ).selected(kept)
+
+
+def without_outer(rows: ContactRows, side: Surface, beyond: Vector) -> ContactRows:
+    """Add the functions N_j of nodes far beyond the border of the master to others.
+
+    Parameters
+    ----------
+    rows : one mortar row for each covered node
+    side : slave side at X + u^k
+    beyond : (s,) distances of the nodes beyond the border, see `Feet`
+
+    """
+    s, place, facets = beyond.size, rows.place, side.facets
+    kept = np.zeros(s, dtype=bool)
+    kept[place] = beyond[place] <= side.radius[place]
+    if kept[place].all():
+        return rows
+    # E (s, s) divides the function of a node among the nodes with a row in its facets
+    i = np.repeat(facets, facets.shape[1], axis=1).ravel()
+    j = np.tile(facets, (1, facets.shape[1])).ravel()
+    given = kept[i] & ~kept[j]
+    E = csr_array((np.ones(given.sum()), (i[given], j[given])), shape=(s, s))
+    E.data[:] = 1.0
+    E.data /= np.bincount(E.indices, minlength=s)[E.indices]
+    E = csr_array(E + diags_array(kept.astype(float)))[kept][:, place]
+    share, areas = E @ rows.share, side.areas
+    W = csr_array(diags_array(1 / share) @ E @ diags_array(rows.share))
+    per_row, every = rows.T.shape[0] // place.size, np.arange(share.size)
+    return ContactRows(
+        B=csr_array(W @ rows.B),
+        c=W @ rows.c,
+        T=csr_array(kron(W, eye_array(per_row)) @ rows.T),
+        row=np.repeat(every, per_row),
+        share=share,
+        place=np.flatnonzero(kept),
+        covered=E @ (rows.covered * areas[place]) / areas[kept],
+        at=every,
+    )
 
 
 def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:

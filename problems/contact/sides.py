@@ -18,7 +18,7 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.contact.surface import current_surface
-from mortarbench.problems.fem.mesh import as_vectors
+from mortarbench.problems.fem.mesh import as_vectors, dofs_of
 
 RIGID = "rigid"  #: name of a rigid master
 ACTIVE_THRESHOLD = 1e-6  #: a contact row is active where λ_i > ACTIVE_THRESHOLD·max λ
@@ -35,11 +35,11 @@ def contact_sides(
     """Return forces, pressures and gaps along the slave side of each pair, in SI units.
 
     The nodal force is the sum of the contact and friction forces of the pair on a slave
-    node. The pressure is the multiplier of the node's row, divided by the undeformed
-    length (in 3D, area) ∫N_j of the node that the master covers. For the basis N_j of
-    mortar contact, it is the nodal value of the traction; otherwise, it is the contact
-    force on the node per area. The gap is the slack c − Bu of the row of the node; with
-    mortar contact, it is the mean gap around the node, weighted as in the row.
+    node. The pressure is the force of the node's row on the slave, against the outward
+    normal of the deformed side, divided by the part of the undeformed length (in 3D,
+    area) ∫N_j that the master covers. For the basis N_j of mortar contact, it is the
+    nodal value of the traction. The gap is the slack c − Bu of the row of the node;
+    with mortar contact, it is the mean gap around the node, weighted as in the row.
 
     With friction, the shear is the multiplier of the friction row, along the tangent
     (−n_y, n_x) and divided by the same length; in 3D, it is the norm of the two
@@ -50,7 +50,7 @@ def contact_sides(
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     normal, tangential = np.split(s.z * F, [primal.h.size])
-    points, dim = bodies.mesh.points, bodies.mesh.dim
+    points, dim, u = bodies.mesh.points, bodies.mesh.dim, s.x * l
     slaves = [pair.slave_nodes for pair in bodies.pairs]
     first = np.cumsum([0, *(nodes.size for nodes in slaves)])
     owner, places = np.repeat(np.arange(len(slaves)), np.diff(first)), int(first[-1])
@@ -81,15 +81,24 @@ def contact_sides(
         shearing = np.zeros_like(force)
         if acts:
             shearing -= as_vectors(friction.T.T @ (tangential * slipping), dim)[slave]
-        side = current_surface(points, np.zeros(points.size), pair.slave, "slave")
-        area = side.areas * covered[here]
+        area = current_surface(points, 0 * u, pair.slave, "slave").areas * covered[here]
+        # force of each row on the slave, per unit multiplier
+        on_slave = [B[:, dofs_of(slave, dim, axis)].sum(axis=1) for axis in range(dim)]
+        mine = owner[rows.place] == k
+        normals = current_surface(points, u, pair.slave, "slave").node_normal
+        against = np.ones(slave.size)
+        against[rows.place[mine] - first[k]] = np.einsum(
+            "xe,ex->e",
+            np.stack(on_slave)[:, rows.at[mine]],
+            normals[rows.place[mine] - first[k]],
+        )
         sides.append(
             ContactSide(
                 name=name,
                 nodes=slave,
                 length=area,
                 force=force + shearing,
-                pressure=push[here] / area,
+                pressure=push[here] * against / area,
                 gap=gap[here],
                 push=push[here],
                 shear=shear[here] / area if acts else None,

@@ -67,6 +67,18 @@ class Surface:
             return nodal_lengths(self.x)
         return nodal_areas(self.x, self.facets)[1]
 
+    @property
+    def radius(self) -> Vector:
+        """Largest distance of a corner from the centre of a facet of each node (v,), m.
+
+        In 2D, this is half the length of the longer segment.
+        """
+        corners, radius = self.x[self.facets], np.zeros(len(self.x))
+        offset = corners - corners.mean(axis=1, keepdims=True)
+        largest = np.linalg.norm(offset, axis=2).max(axis=1)
+        np.maximum.at(radius, self.facets, largest[:, None])
+        return radius
+
     def areas_in(self, part: NDArray[np.bool_]) -> Vector:
         """Return ∫N_j (v,) over the facets in a mask (f,); see `areas`."""
         areas = np.zeros(len(self.x))

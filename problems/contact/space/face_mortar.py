@@ -48,9 +48,13 @@ from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.mortar import Basis
-from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.contact.rows import ContactRows, without_outer
 from mortarbench.problems.contact.segment_search import Reach
-from mortarbench.problems.contact.space.triangles import FaceTriangles, triangulated
+from mortarbench.problems.contact.space.triangles import (
+    FaceTriangles,
+    closest_points,
+    triangulated,
+)
 from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
@@ -129,10 +133,10 @@ def face_mortar(
         for side, name in ((slave, "slave"), (master, "master"))
     )
     nodes = np.unique(slave), np.unique(master)
-    whole = _integrals_of(triangulated(s))
-    s = s if part is None else s.part(part)
-    at = overlaps(triangulated(s), triangulated(m), reach)
+    own, other = triangulated(s), triangulated(m)
+    at = overlaps(own if part is None else triangulated(s.part(part)), other, reach)
     A = _dual(at) if basis == "dual" else np.eye(4)  # Φ = A N
+    at = at if part is None else at._replace(slave=np.flatnonzero(part)[at.slave])
     j, k = s.facets[at.slave], m.facets[at.master]
     cover = _gather(at.area, j, len(s.x))
     gap = _gather((A @ at.gap[..., None])[..., 0], j, len(s.x))
@@ -161,16 +165,17 @@ def face_mortar(
         # both tangents of a row in succession
         order = np.arange(2 * active.size).reshape(2, -1).T.ravel()
         T = csr_array(vstack(stacked).tocsr()[order])
-    return ContactRows(
+    covered = ContactRows(
         B,
         gap[active] / cover[active] + B @ u,
         T,
         row,
         cover[active],
         active,
-        (cover / whole)[active],
+        (cover / _integrals_of(own))[active],
         np.arange(active.size),
     )
+    return without_outer(covered, s, closest_points(s.x, other).beyond)
 
 
 def _integrals_of(side: FaceTriangles) -> Vector:
