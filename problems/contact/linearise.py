@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.contact.bodies import Bodies, ContactSides, UnassembledBodies
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    ContactSides,
+    UnassembledBodies,
+)
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_segment import (
@@ -23,7 +28,11 @@ from mortarbench.problems.contact.segment_search import Reach, closest_points
 from mortarbench.problems.contact.sides import pair_names
 from mortarbench.problems.contact.space.face_mortar import face_mortar
 from mortarbench.problems.contact.space.node_to_face import node_to_face
-from mortarbench.problems.contact.surface import current_positions, current_surface
+from mortarbench.problems.contact.surface import (
+    Points,
+    current_positions,
+    current_surface,
+)
 from mortarbench.problems.fem.mesh import Nodes
 
 #: mapping from the dimension to the functions that implement the methods "nts" and
@@ -53,46 +62,74 @@ def linearisation(
         numbered as in `closest_segments`; −1 selects the closest segment at each u
     """
     nodal, integral = METHODS[bodies.mesh.dim]
-    elastic = nodal if contact == "nts" else partial(integral, basis=basis)
-    methods = [
-        partial(elastic, reach=Reach(distance=pair.reach))
-        if pair.rigid is None
-        else partial(rigid_rows, reach=pair.reach)
-        for pair in bodies.pairs
+    pairs, nodes = bodies.pairs, [pair.slave_nodes for pair in bodies.pairs]
+    methods: list[Callable[..., ContactRows]] = [
+        rigid_rows
+        if pair.rigid is not None
+        else nodal
+        if contact == "nts"
+        else partial(integral, basis=basis, reach=Reach(distance=pair.reach))
+        for pair in pairs
     ]
     if fixed_segments is not None:
         parts = _split_by_pair(bodies, fixed_segments)
-        methods = [
-            partial(method, fixed_segments=part)
-            for method, part in zip(methods, parts, strict=True)
-        ]
-    has_friction = [law.acts for law in laws] or [False] * len(bodies.pairs)
-    nodes = [pair.slave_nodes for pair in bodies.pairs]
+        methods = [partial(node_to_segment, fixed_segments=part) for part in parts]
+    has_friction = [law.acts for law in laws] or [False] * len(pairs)
 
     def linearise(u: Vector) -> ContactRows:
         parts = [
-            rows(
+            _within_reach(
+                rows(
+                    bodies.mesh.points,
+                    u,
+                    pair.slave,
+                    pair.master if pair.rigid is None else pair.rigid,
+                    tangential=tangential,
+                ),
                 bodies.mesh.points,
                 u,
-                pair.slave,
-                pair.master if pair.rigid is None else pair.rigid,
-                tangential=tangential,
+                pair,
             )
-            for rows, pair, tangential in zip(
-                methods, bodies.pairs, has_friction, strict=True
-            )
+            for rows, pair, tangential in zip(methods, pairs, has_friction, strict=True)
         ]
         if not u.any():
-            for name, part in zip(pair_names(bodies), parts, strict=True):
-                if not part.c.size:
-                    raise InputError(
-                        f"contact {name}: no node of the slave side faces its master "
-                        "within reach; expected two sides that face each other, each "
-                        "with its body on the left (in 3D, with outward normals)"
-                    )
+            for name, pair, part in zip(pair_names(bodies), pairs, parts, strict=True):
+                _check_facing(name, pair, part, bodies.mesh.points)
         return parts[0] if len(parts) == 1 else joined(parts, nodes)
 
     return linearise
+
+
+def _within_reach(
+    rows: ContactRows, points: Points, u: Vector, pair: ContactPair
+) -> ContactRows:
+    """Return the rows whose gaps at u are within the reach of the pair."""
+    distance = pair.reach
+    if distance is None and pair.rigid is None:
+        sides = (current_positions(points, u, side.ravel(), "") for side in pair.sides)
+        distance = max(float(np.linalg.norm(np.ptp(x, axis=0))) for x in sides)
+    if distance is None:
+        return rows
+    near = np.abs(rows.c - rows.B @ u) <= distance
+    return rows if near.all() else rows.selected(near)
+
+
+def _check_facing(
+    name: str, pair: ContactPair, rows: ContactRows, points: Points
+) -> None:
+    """Raise InputError if no row pushes the undeformed slave against its normal.
+
+    The angle may be up to 60°, as for the rays of mortar contact.
+    """
+    side = current_surface(points, np.zeros(points.size), pair.slave, "slave")
+    along = rows.resultants(pair.slave_nodes, points.shape[1])
+    outward = np.einsum("ex,ex->e", along, side.node_normal[rows.place])
+    if not (outward >= -Reach().cosine).any():
+        raise InputError(
+            f"contact {name}: no node of the slave side faces its master within reach; "
+            "expected two sides that face each other, each with its body on the left "
+            "(in 3D, with outward normals)"
+        )
 
 
 def contact_stiffness(

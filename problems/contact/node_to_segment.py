@@ -30,15 +30,21 @@ between iterations.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.mortar import mortar
-from mortarbench.problems.contact.rows import ContactRows, Feet, nodal_rows
+from mortarbench.problems.contact.rows import (
+    ContactRows,
+    Feet,
+    SlaveNodes,
+    nodal_rows,
+)
 from mortarbench.problems.contact.segment_search import (
     ClosestPoints,
-    Reach,
     along_lines,
     closest_points,
 )
@@ -47,10 +53,11 @@ from mortarbench.problems.contact.surface import (
     Surface,
     current_positions,
     current_surface,
+    surface,
     tangents,
 )
 from mortarbench.problems.fem.elements import cross
-from mortarbench.problems.fem.mesh import Nodes, dofs_of
+from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
 
 def node_to_segment(
@@ -59,7 +66,6 @@ def node_to_segment(
     slave: Nodes,
     master: Nodes,
     *,
-    reach: Reach = Reach(),  # noqa: B008 - frozen
     tangential: bool = False,
     fixed_segments: Nodes | None = None,
 ) -> ContactRows:
@@ -74,7 +80,6 @@ def node_to_segment(
     u : (n,) displacement u^k at which to linearise, m
     slave : (s,) chain of nodes with its body on the left
     master : (v,) chain of nodes with its body on the left
-    reach : limits on the distance of a node and, for the side as a whole, on the angle
     tangential : add tangential rows for friction
     fixed_segments : (s,) fixed segment of each slave node, given by the position of its
         first node in the master chain; −1 selects the closest segment
@@ -85,36 +90,20 @@ def node_to_segment(
         If a position is not finite or the master has no segment of positive length.
 
     """
-    side, line = (
-        current_surface(points, u, chain, name)
-        for chain, name in ((slave, "slave"), (master, "master"))
-    )
-    closest = _projections(side.x, line, fixed_segments)
+    x = current_positions(points, u, slave, "slave")
+    line = current_surface(points, u, master, "master")
+    closest = _projections(x, line, fixed_segments)
     N = np.stack([1 - closest.xi, closest.xi], axis=1)
     ends = np.stack([closest.segment, closest.segment + 1], axis=1)
     foot = np.einsum("sa,sax->sx", N, line.x[ends])
+    radius = line.radius[closest.segment]
     return nodal_rows(
         u,
-        slave,
-        side,
-        Feet(
-            master[ends],
-            N,
-            foot,
-            closest.normal,
-            closest.beyond,
-            np.linalg.norm(line.x[ends[:, 1]] - line.x[ends[:, 0]], axis=1) / 2,
-        ),
-        (reach.max_distance(side, line), reach.cosine),
-        lambda part: mortar(
-            points,
-            u,
-            slave,
-            master,
-            basis="standard",
-            part=part,
-            reach=reach,
-            tangential=tangential,
+        SlaveNodes(slave, x, nodal_lengths(x)),
+        Feet(master[ends], N, foot, closest.normal, closest.beyond, radius),
+        lambda: surface(x, "slave"),
+        partial(
+            mortar, points, u, slave, master, basis="standard", tangential=tangential
         ),
         tangential=tangential,
     )

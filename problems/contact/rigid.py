@@ -92,7 +92,6 @@ def rigid_rows(
     side: Nodes,
     rigid: RigidBody,
     *,
-    reach: float | None = None,
     tangential: bool = False,
 ) -> ContactRows:
     """Return the contact rows of a side against a rigid body, linearised at u.
@@ -102,7 +101,6 @@ def rigid_rows(
     points : (N, dim) reference positions X, m
     u : (n,) displacement u^k at which to linearise, m
     side : nodes or faces of the side, a boundary of a `Mesh`
-    reach : largest gap of a node with a row, m; None for no limit
     tangential : add tangential rows for friction
 
     Raises
@@ -118,7 +116,7 @@ def rigid_rows(
     along = -tangents(normal)[: nodes.size if tangential else 0]
     row = np.repeat(np.arange(len(along)), dim - 1)
     reference = current_surface(points, np.zeros_like(u), side, "slave")
-    rows = ContactRows(
+    return ContactRows(
         B=_rows(-normal, components, points.size),
         c=gap - np.einsum("sx,sx->s", normal, u[components]),
         T=_rows(along.reshape(-1, dim), components[row], points.size),
@@ -128,7 +126,6 @@ def rigid_rows(
         covered=np.ones(nodes.size),
         at=every,
     )
-    return rows if reach is None else rows.selected(np.abs(gap) <= reach)
 
 
 def _rows(values: Points, components: Nodes, n: int) -> csr_array:

@@ -87,6 +87,11 @@ class ContactRows(NamedTuple):
         at_place[self.place] = force[self.at] * share
         return at_place
 
+    def resultants(self, nodes: Nodes, dim: int) -> Points:
+        """Return the sums (m, dim) of the entries of each row at some nodes."""
+        sums = [self.B[:, dofs_of(nodes, dim, axis)].sum(axis=1) for axis in range(dim)]
+        return np.stack(sums, axis=1)
+
     def selected(self, keep: NDArray[np.bool_]) -> ContactRows:
         """Return the rows in a mask (m,), with their tangential rows and entries."""
         number = np.cumsum(keep) - 1
@@ -103,6 +108,14 @@ class ContactRows(NamedTuple):
         )
 
 
+class SlaveNodes(NamedTuple):
+    """Slave nodes of a pair."""
+
+    number: Nodes  #: (s,) numbers
+    x: Points  #: (s, dim) positions X + u^k, m
+    areas: Vector  #: (s,) lengths or areas ∫N_j of the slave side, m or m²
+
+
 class Feet(NamedTuple):
     """Closest points of all s slave nodes on the master, which may be extended."""
 
@@ -116,18 +129,12 @@ class Feet(NamedTuple):
     radius: Vector  #: (s,) radius of the master facet, m
 
 
-#: function that returns the mortar rows, with the basis N_j, of the slave facets in a
-#: mask (f,)
-Integral = Callable[[NDArray[np.bool_]], ContactRows]
-
-
 def nodal_rows(
     u: Vector,
-    slave: Nodes,
-    side: Surface,
+    slave: SlaveNodes,
     feet: Feet,
-    limits: tuple[float, float],
-    integral: Integral,
+    side: Callable[[], Surface],
+    integral: Callable[..., ContactRows],
     *,
     tangential: bool,
 ) -> ContactRows:
@@ -136,42 +143,36 @@ def nodal_rows(
     Parameters
     ----------
     u : (n,) displacement u^k at which to linearise, m
-    slave : (s,) slave nodes
-    side : slave side at X + u^k
-    limits : largest distance of a node from its closest point, m, and largest cosine
-        between the normals of both sides there. If no node is within both limits, the
-        side does not face the master, and has no row
+    side : function that returns the slave side at X + u^k
+    integral : function that returns the mortar rows, with the basis N_j, of the slave
+        facets in a mask `part` (f,)
     tangential : add tangential rows for friction
 
     """
-    s, dim = side.x.shape
-    offset = side.x - feet.x
-    gap = np.einsum("sx,sx->s", offset, feet.normal)
+    s, dim = slave.x.shape
+    gap = np.einsum("sx,sx->s", slave.x - feet.x, feet.normal)
     # stencil of each row: the slave node and the nodes of the master facet
-    node = np.column_stack([slave, feet.node])
+    node = np.column_stack([slave.number, feet.node])
     weight = np.column_stack([-np.ones(s), feet.N])
     B = rows_along(node, weight, feet.normal, u.size)
     # friction rows have the weights of their contact row, along the tangents
     along = tangents(feet.normal)[: s if tangential else 0]
     row, every = np.repeat(np.arange(len(along)), dim - 1), np.arange(s)
     T = rows_along(node[row], weight[row], along.reshape(-1, dim), u.size)
-    rows = ContactRows(B, gap + B @ u, T, row, side.areas, every, np.ones(s), every)
-    near = np.linalg.norm(offset, axis=1) <= limits[0]
-    cosine = np.einsum("sx,sx->s", side.node_normal, feet.normal)
-    if not (near & (cosine <= limits[1])).any():
-        near[:] = False
-    outside = feet.beyond > EXTENSION * np.minimum(side.radius, feet.radius)
-    if not (near & outside).any():
-        return rows.selected(near)
-    return _with_integrals(rows, side, outside, near & ~outside, integral)
+    rows = ContactRows(B, gap + B @ u, T, row, slave.areas, every, np.ones(s), every)
+    if feet.beyond.any():
+        radius = np.minimum(side().radius, feet.radius)
+        outside = feet.beyond > EXTENSION * radius
+        if outside.any():
+            return _with_integrals(rows, side(), outside, integral)
+    return rows
 
 
 def _with_integrals(
     nodal: ContactRows,
     side: Surface,
     outside: NDArray[np.bool_],
-    inside: NDArray[np.bool_],
-    integral: Integral,
+    integral: Callable[..., ContactRows],
 ) -> ContactRows:
     """Integrate over the slave facets with a node beyond the border of the master.
 
@@ -179,19 +180,18 @@ def _with_integrals(
     ----------
     nodal : rows of all slave nodes
     outside : (s,) mask of the nodes beyond the border
-    inside : (s,) mask of the nodes that keep a row
 
     """
     s, areas = nodal.c.size, side.areas
     cut = np.asarray(outside[side.facets].any(axis=1))
-    part, whole = integral(cut), areas.copy()
+    part, whole = integral(part=cut), areas.copy()
     bordered = np.unique(side.facets[cut])
     whole[bordered] = side.areas_in(~cut)[bordered]
-    whole[~inside] = 0.0
+    whole[outside] = 0.0
     covered = np.zeros((2, s))  # ∫N_j on the cut facets, as in `share` and in `covered`
     covered[:, part.place] = part.share, part.covered * areas[part.place]
     # a node whose facets are covered only at an angle beyond that of the integrals
-    alone = inside & (whole + covered[0] == 0)
+    alone = ~outside & (whole + covered[0] == 0)
     whole[alone] = areas[alone]
     # the rows are V · nodal + W · part, with weights that sum to one
     kept = whole + covered[0] > 0

@@ -18,7 +18,7 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.contact.surface import current_surface
-from mortarbench.problems.fem.mesh import as_vectors, dofs_of
+from mortarbench.problems.fem.mesh import as_vectors
 
 RIGID = "rigid"  #: name of a rigid master
 ACTIVE_THRESHOLD = 1e-6  #: a contact row is active where λ_i > ACTIVE_THRESHOLD·max λ
@@ -72,8 +72,8 @@ def contact_sides(
     ):
         slave, here = slaves[k], slice(first[k], first[k + 1])
         # fraction (m,) of each row's force that belongs to this pair
-        own = rows.of_rows(rows.share * (owner[rows.place] == k))
-        own /= rows.of_rows(rows.share)
+        mine = owner[rows.place] == k
+        own = rows.of_rows(rows.share * mine) / rows.of_rows(rows.share)
         # 0.0 − x instead of −x avoids negative zeros in reports
         force = as_vectors(0.0 - B.T @ (normal * own), dim)[slave]
         slipping = own[friction.row]  # (k,) the same for friction rows
@@ -82,15 +82,11 @@ def contact_sides(
         if acts:
             shearing -= as_vectors(friction.T.T @ (tangential * slipping), dim)[slave]
         area = current_surface(points, 0 * u, pair.slave, "slave").areas * covered[here]
-        # force of each row on the slave, per unit multiplier
-        on_slave = [B[:, dofs_of(slave, dim, axis)].sum(axis=1) for axis in range(dim)]
-        mine = owner[rows.place] == k
-        normals = current_surface(points, u, pair.slave, "slave").node_normal
-        against = np.ones(slave.size)
-        against[rows.place[mine] - first[k]] = np.einsum(
-            "xe,ex->e",
-            np.stack(on_slave)[:, rows.at[mine]],
-            normals[rows.place[mine] - first[k]],
+        outward = current_surface(points, u, pair.slave, "slave").node_normal
+        along, place = rows.resultants(slave, dim)[rows.at[mine]], rows.place[mine]
+        pressing = np.zeros(slave.size)
+        pressing[place - first[k]] = push[place] * np.einsum(
+            "ex,ex->e", along, outward[place - first[k]]
         )
         sides.append(
             ContactSide(
@@ -98,7 +94,7 @@ def contact_sides(
                 nodes=slave,
                 length=area,
                 force=force + shearing,
-                pressure=push[here] * against / area,
+                pressure=pressing / area,
                 gap=gap[here],
                 push=push[here],
                 shear=shear[here] / area if acts else None,

@@ -13,11 +13,17 @@ slave nodes beyond the border of the master, see `problems.contact.rows`.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.rows import ContactRows, Feet, nodal_rows
-from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.rows import (
+    ContactRows,
+    Feet,
+    SlaveNodes,
+    nodal_rows,
+)
 from mortarbench.problems.contact.space.face_mortar import face_mortar
 from mortarbench.problems.contact.space.triangles import (
     closest_points,
@@ -34,7 +40,6 @@ def node_to_face(
     slave: Nodes,
     master: Nodes,
     *,
-    reach: Reach = Reach(),  # noqa: B008 - frozen
     tangential: bool = False,
 ) -> ContactRows:
     """Linearise the non-penetration condition of all slave nodes at u.
@@ -44,7 +49,6 @@ def node_to_face(
     points : (N, 3) reference positions X, m
     u : (3N,) displacement u^k at which to linearise, m
     slave, master : (f, 4), (g, 4) faces of both sides, boundaries of a `Mesh`
-    reach : limits on the distance of a node and, for the side as a whole, on the angle
     tangential : add two tangential rows per contact row
 
     Returns
@@ -72,27 +76,20 @@ def node_to_face(
         weight = projected_on_planes(side.x[outside], faces.vertices[t])
         N[outside] = np.einsum("sv,svc->sc", weight, faces.shape[t])
         normal[outside] = faces.normals[t]
+    foot = np.einsum("sa,sax->sx", N, other.x[at])
+    radius = faces.radius[closest.face]
     return nodal_rows(
         u,
-        own,
-        side,
-        Feet(
-            nodes[at],
-            N,
-            np.einsum("sa,sax->sx", N, other.x[at]),
-            normal,
-            closest.beyond,
-            faces.radius[closest.face],
-        ),
-        (reach.max_distance(side, other), reach.cosine),
-        lambda part: face_mortar(
+        SlaveNodes(own, side.x, side.areas),
+        Feet(nodes[at], N, foot, normal, closest.beyond, radius),
+        lambda: side,
+        partial(
+            face_mortar,
             points,
             u,
             slave,
             master,
             basis="standard",
-            part=part,
-            reach=reach,
             tangential=tangential,
         ),
         tangential=tangential,
