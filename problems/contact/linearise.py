@@ -74,6 +74,7 @@ def linearisation(
     if fixed_segments is not None:
         parts = _split_by_pair(bodies, fixed_segments)
         methods = [partial(node_to_segment, fixed_segments=part) for part in parts]
+    size = float(np.ptp(bodies.mesh.points, axis=0).max())
     has_friction = [law.acts for law in laws] or [False] * len(pairs)
 
     def linearise(u: Vector) -> ContactRows:
@@ -95,7 +96,7 @@ def linearisation(
         if not u.any():
             for name, pair, part in zip(pair_names(bodies), pairs, parts, strict=True):
                 _check_facing(name, pair, part, bodies.mesh.points)
-        return parts[0] if len(parts) == 1 else joined(parts, nodes)
+        return parts[0] if len(parts) == 1 else joined(parts, nodes, size)
 
     return linearise
 

@@ -42,7 +42,8 @@ from mortarbench.problems.fem.mesh import Nodes, dofs_of
 #: a nodal row, relative to the smaller radius of a facet of both sides: a tenth of the
 #: length of a segment, the default of Abaqus
 EXTENSION = 0.2
-#: two rows of a slave node whose entries differ by at most this value are the same row
+#: two rows of a slave node are the same if their entries differ by at most this value,
+#: and their gaps by at most this fraction of the size of the bodies
 SAME_ROW = 1e-9
 #: entries of a row at free components whose sum is at most this fraction of the sum of
 #: all entries count as rounding errors of the normal
@@ -269,10 +270,13 @@ def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr
     return B
 
 
-def joined(parts: Sequence[ContactRows], nodes: Sequence[Nodes]) -> ContactRows:
+def joined(
+    parts: Sequence[ContactRows], nodes: Sequence[Nodes], size: float
+) -> ContactRows:
     """Join the rows of several pairs; equal rows of a common slave node become one.
 
     nodes : slave nodes of each pair
+    size : size of the bodies, relative to which gaps are compared, m
     """
     first_row = np.cumsum([0, *(part.c.size for part in parts)])
     first_place = np.cumsum([0, *(one.size for one in nodes)])
@@ -301,6 +305,7 @@ def joined(parts: Sequence[ContactRows], nodes: Sequence[Nodes]) -> ContactRows:
     same = np.full(common.size, False)
     if common.size:
         same = abs(rows.B[i] - rows.B[j]).max(axis=1).toarray().ravel() <= SAME_ROW
+        same &= np.abs(rows.c[i] - rows.c[j]) <= SAME_ROW * size
         same &= slips[i] == slips[j]  # otherwise the friction of one would be lost
     leader = np.arange(rows.c.size)
     for first, second in zip(i[same], j[same], strict=True):
@@ -313,21 +318,11 @@ def without_fixed(rows: ContactRows, fixed: Nodes) -> ContactRows:
     """Return the rows with an entry at a free component.
 
     If supports prescribe all components of a row, its multiplier is a force between
-    supports, which no equation determines. The same holds for the tangential rows of a
-    node, which are dropped together.
+    supports, which no equation determines.
 
     fixed : components that supports prescribe
     """
     free = np.ones(rows.B.shape[1])
     free[fixed] = 0.0
-    keep = _acts(rows.B, free)
-    slips = np.zeros(rows.c.size, dtype=bool)
-    slips[rows.row[_acts(rows.T, free)]] = True
-    slips = slips[rows.row]
-    return rows._replace(T=rows.T[slips], row=rows.row[slips]).selected(keep)
-
-
-def _acts(rows: csr_array, free: Vector) -> NDArray[np.bool_]:
-    """Return a mask (m,) of the rows with entries at free components (n,)."""
-    size = abs(rows)
-    return np.asarray(size @ free > MIN_FREE * (size @ np.ones_like(free)))
+    size = abs(rows.B)
+    return rows.selected(size @ free > MIN_FREE * size.sum(axis=1))
