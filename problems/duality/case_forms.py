@@ -23,6 +23,7 @@ from mortarbench.harness import (
     Vector,
 )
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.problems.contact.balance import least_motion
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
 from mortarbench.problems.contact.rows import ContactRows
@@ -93,6 +94,7 @@ def case_of(
         supported=lambda: elastic.supported,
         quantities=results,
         friction=friction,
+        settle=lambda s: least_motion(bodies.rigid, primal, s, friction),
     )
     return case if problem.exact is None else with_exact_tractions(case, problem.exact)
 
@@ -143,6 +145,7 @@ def contact_case(
     rows: ContactRows,
     form: str,
     *,
+    settle: Callable[[Solution], Solution] = lambda s: s,
     floating: Factorise,
     clamped: Factorise,
     supported: Factorise,
@@ -155,6 +158,8 @@ def contact_case(
     Parameters
     ----------
     rows : contact rows of `primal`
+    settle : function that selects one of the solutions with equal forces, for all
+        results except certificates
     floating : function that factorises K and returns K⁺ with the rigid modes as kernel;
         called only for the form `dual`
     clamped : function that returns K⁺ with the fixed components eliminated; called only
@@ -192,14 +197,18 @@ def contact_case(
         seconds = inverse.seconds + perf_counter() - start
         matrices = _paper(transformed.qp, primal, friction, form, inverse)
     energy = bodies.force * bodies.length
+
+    def recovered(s: Solution) -> Solution:
+        return settle(transformed.recover(s))
+
     return Case(
         qp=transformed.qp,
-        recover=lambda s: transformed.recover(s).x * bodies.length,
-        quantities=lambda s: {**quantities(transformed.recover(s)), **decomposition},
+        recover=lambda s: recovered(s).x * bodies.length,
+        quantities=lambda s: {**quantities(recovered(s)), **decomposition},
         fields=lambda s: fields(
             bodies,
             primal,
-            transformed.recover(s),
+            recovered(s),
             rows,
             friction,
             subdomains=subdomains,
