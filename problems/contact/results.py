@@ -20,6 +20,7 @@ from mortarbench.problems.contact.sides import (
     bodies_of,
     contact_sides,
     states,
+    undetermined_friction,
 )
 from mortarbench.problems.fem.mesh import as_vectors
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
@@ -130,7 +131,9 @@ def friction_quantities(
     """Return counts of friction states, the residual of Coulomb's law and dissipation.
 
     `open`, `stick` and `slip` are the numbers of frictional contact rows that are
-    inactive, active and sticking, and active and slipping, see `states`.
+    inactive, active and sticking, and active and slipping, see `states`. `undetermined`
+    is the number of dependent rows among those that stick, and is omitted if it is 0;
+    friction forces are otherwise not unique, see `undetermined_friction`.
     `sliding_without_contact` is the number of inactive rows with shear, which Tresca's
     law allows; these rows do not count as open. `shear_without_contact` is the fraction
     of Σ‖λ_t‖ that acts on these rows. `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for
@@ -141,7 +144,9 @@ def friction_quantities(
     shear = norms(s.z[primal.h.size :][friction.vectors])
     without_contact = state == SLIDING
     shear_alone = float(shear[without_contact].sum() / (shear.sum() or 1.0))
+    undetermined = undetermined_friction(primal, s, friction)
     return {
+        **({"undetermined": undetermined} if undetermined else {}),
         **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},
         "sliding_without_contact": int(without_contact.sum()),
         "shear_without_contact": shear_alone,
@@ -159,13 +164,14 @@ def pair_results(
 ) -> dict[str, dict[str, Any]]:
     """Return the results of each contact pair by its name.
 
-    `force` is the force on each elastic body of the pair in N/m; `largest_pressure` is
-    the largest nodal pressure on the slave in Pa, and `mean_pressure` its mean over the
-    part of the slave under pressure; `smallest_gap` in m is negative if bodies overlap,
-    and None if no slave node has a row; `half_width` is half the undeformed length in m
-    of the part under pressure (in 3D, `pressed_area` is its area in m²). With friction,
-    `friction_force` is the contribution of friction to the force on the slave in N/m,
-    and `stick` and `slip` are the numbers of sticking and slipping slave nodes.
+    `force` is the force on each elastic body of the pair in N/m; `active` is the number
+    of slave nodes under pressure; `largest_pressure` is the largest nodal pressure on
+    the slave in Pa, and `mean_pressure` its mean over the part of the slave under
+    pressure; `smallest_gap` in m is negative if bodies overlap, and None if no slave
+    node has a row; `half_width` is half the undeformed length in m of the part under
+    pressure (in 3D, `pressed_area` is its area in m²). With friction, `friction_force`
+    is the contribution of friction to the force on the slave in N/m, and `stick` and
+    `slip` are the numbers of sticking and slipping slave nodes.
     """
     results = {}
     sides = contact_sides(bodies, primal, s, rows, friction)
@@ -182,6 +188,7 @@ def pair_results(
         push = float((side.pressure * side.length)[mask].sum())
         results[side.name] = {
             "force": force,
+            "active": int(mask.sum()),
             "largest_pressure": float(side.pressure.max()),
             "mean_pressure": push / pressed if pressed else 0.0,
             "smallest_gap": (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array, diags_array, vstack
 
 from mortarbench.harness import QP, ContactSide, Friction, Solution, Vector
 from mortarbench.harness.mechanics import NO_FRICTION
@@ -22,6 +22,11 @@ from mortarbench.problems.fem.mesh import as_vectors
 
 RIGID = "rigid"  #: name of a rigid master
 ACTIVE_THRESHOLD = 1e-6  #: a contact row is active where λ_i > ACTIVE_THRESHOLD·max λ
+#: largest slip that counts as zero, relative to the largest displacement
+NO_SLIP = 1e-12
+#: pivots of the Gram matrix of unit rows up to this value belong to dependent rows; the
+#: matrix is regularised by the square of this value
+DEPENDENT = 1e-8
 _STATE = f"U{len(SLIDING)}"  #: dtype of arrays of states; SLIDING is the longest name
 
 
@@ -118,17 +123,54 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
     if not vectors.size:
         return np.zeros(0, dtype=_STATE)
     normal, tangential = np.split(s.z, [primal.h.size])
-    diagonal = csr_array(primal.P).diagonal()
-    # T diag(K)⁻¹ Tᵀ of each row, with stiffness 1 for components without stiffness
-    softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
-    shear, first = norms(tangential[vectors]), vectors[:, 0]
-    room = (friction.bound[first] - shear) * softness[vectors].mean(axis=1)
-    sticks = room >= norms(friction.slip(s.x))
-    closed = active(normal)[friction.row[first]]
+    shear = norms(tangential[vectors])
+    sticks = _room(primal, s, friction) >= norms(friction.slip(s.x))
+    closed = active(normal)[friction.row[vectors[:, 0]]]
     sheared = shear > ACTIVE_THRESHOLD * np.abs(s.z).max(initial=0.0)
     apart = np.where(sheared, SLIDING, "open")
     touching = np.where(sticks, "stick", "slip")
     return np.where(closed, touching, apart).astype(_STATE)
+
+
+def _room(primal: QP, s: Solution, friction: Friction) -> Vector:
+    """Return the slip (v,) up to which tangential vectors stick, see `states`."""
+    vectors, diagonal = friction.vectors, csr_array(primal.P).diagonal()
+    # T diag(K)⁻¹ Tᵀ of each row, with stiffness 1 for components without stiffness
+    softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
+    shear = norms(s.z[primal.h.size :][vectors])
+    room = friction.bound[vectors[:, 0]] - shear
+    return np.asarray(room * softness[vectors].mean(axis=1))
+
+
+def undetermined_friction(primal: QP, s: Solution, friction: Friction) -> int:
+    """Return the dimension of the multipliers of sticking rows that change no force.
+
+    The rows of closed contact and of sticking vectors are restricted to the components
+    that supports leave free. Combinations of these rows that vanish have no effect on
+    the displacement; those of contact rows alone are not counted.
+    """
+    slip, size = norms(friction.slip(s.x)), np.abs(s.x).max(initial=0.0)
+    sticks = slip <= np.maximum(_room(primal, s, friction), NO_SLIP * size)
+    sticks &= friction.bound[friction.vectors[:, 0]] > 0
+    B = csr_array(primal.G)[active(s.z[: primal.h.size])]
+    T = friction.T[friction.vectors[sticks].ravel()]
+    free = np.ones(s.x.size)
+    free[csr_array(primal.A).indices] = 0.0
+    every = csr_array(vstack([B, T]) @ diags_array(free))
+    return _defect(every) - _defect(every[: B.shape[0]])
+
+
+def _defect(rows: csr_array) -> int:
+    """Return the number of rows (m, n) that depend on the others."""
+    if not rows.shape[0]:
+        return 0
+    length = np.sqrt(rows.multiply(rows).sum(axis=1))
+    rows = csr_array(diags_array(1 / np.where(length > 0, length, 1.0)) @ rows)
+    # imported here, because only friction needs it
+    from sksparse.cholmod import cholesky
+
+    pivots = cholesky(csc_array(rows @ rows.T), beta=DEPENDENT**2).D()
+    return int((pivots <= DEPENDENT).sum())
 
 
 def active(normal: Vector) -> NDArray[np.bool_]:
