@@ -339,10 +339,17 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
                 "no node is in contact, so the answer is the same as without contact "
                 "conditions; check the direction of the load and the initial gap"
             )
-        elif record.quantities.get("active") == 1 < record.quantities["contact_rows"]:
+        elif _single_nodes(record):
             reasons.append(
                 "a single node is in contact, so the computed pressure depends on the "
                 "mesh width and grows on finer meshes; refine the mesh near the contact"
+            )
+        if record.quantities.get("undetermined"):
+            reasons.append(
+                "friction forces are not unique: where supports or other contact rows "
+                "prevent slip, other friction forces have the same displacements, so "
+                "that sums such as friction_force depend on the solver; remove "
+                "friction there, or the supports along the contact"
             )
     with suppress(Exception), one_thread():
         reasons += _large_displacements(case, solution)
@@ -352,6 +359,14 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
 def _of_input(case: Case) -> tuple[str, ...]:
     """Return the remarks on the input; () if only MPI ranks have built the case."""
     return case.remarks if "family_case" in vars(case) else ()
+
+
+def _single_nodes(record: Record) -> bool:
+    """Return True if a pair with several rows is in contact at a single node."""
+    pairs = record.quantities.get("contacts", {}).values()
+    return any(pair.get("active") == 1 for pair in pairs) and (
+        record.quantities["contact_rows"] > len(pairs)
+    )
 
 
 def _is_open(case: Case, record: Record, solution: Solution) -> bool:

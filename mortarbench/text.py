@@ -43,6 +43,7 @@ _CONTACTS = "contacts"  #: quantity that maps each contact pair to a table of re
 _SHARE = "shear_without_contact"
 _CONTACT_UNITS = {
     "largest_pressure": "Pa",
+    "mean_pressure": "Pa",
     "smallest_gap": "m",
     "half_width": "m",
     "pressed_area": "m²",

@@ -1,4 +1,4 @@
-"""Check, before any solve, that supports and contacts can balance the loads on bodies.
+"""Rigid motions that supports allow: balance before a solve, least motion after it.
 
 The potential energy is unbounded below if and only if the load does positive work fᵀr
 on a rigid motion r that the supports allow (B_D r = 0) and that closes no gap (B
@@ -7,10 +7,18 @@ energy is bounded if and only if there are contact forces λ ≥ 0 with Zᵀ(f �
 there are no such forces, Moreau's decomposition applies: the residual of the
 non-negative least-squares problem for λ is a motion r as above (in coordinates of Z),
 and also the unbalanced part of the load.
+
+If rigid motions remain that neither supports nor closed contacts prevent, the forces of
+a solution are unique and its displacement is not. A disc between plates can roll, for
+example: mortar rows of its nodes do not change if it turns about its centre, because
+the averaged normals of a regular chain are radial. Only at the ends of its arc are they
+normal to a single chord, so that a solver could turn the disc until an end touches.
+`least_motion` selects the displacement with the least rigid motion.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +26,10 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
-from mortarbench.harness import Friction, InputError, Matrix
+from mortarbench.harness import QP, Friction, InputError, Matrix, Solution
+from mortarbench.harness.mechanics import contact_rows
 from mortarbench.problems.contact.bodies import UnassembledBodies
+from mortarbench.problems.contact.sides import active
 from mortarbench.problems.fem.elasticity import rigid_motions
 
 #: largest unbalanced fraction of the load that is attributed to rounding of
@@ -159,6 +169,37 @@ def check_friction(
         )
 
 
+def least_motion(
+    rigid: Floats, primal: QP, s: Solution, friction: Friction
+) -> Solution:
+    """Return a solution without rigid motions that change neither forces nor slip.
+
+    The motion Mβ that is subtracted from u solves  min ‖β − Mᵀu‖  subject to the
+    contact rows, with an orthonormal basis M of the motions along all closed contacts.
+    This is a least-distance problem (Lawson and Hanson 1974, chapter 23).
+
+    rigid : (n, r) orthonormal rigid motions of all bodies
+    """
+    Z = rigid @ _kernel(rigid[csr_array(primal.A).indices])
+    if not Z.shape[1]:
+        return s
+    rows, limits = contact_rows(primal, friction)
+    closed = np.append(active(s.z[: primal.h.size]), friction.bound > 0)
+    M = Z @ _kernel(rows[closed] @ Z, MAX_IMBALANCE)
+    # γ = β − Mᵀu: min ‖γ‖ subject to Aγ ≥ h
+    A, aim = rows[~closed] @ M, M.T @ s.x
+    h = -np.maximum((limits - rows @ s.x)[~closed], 0.0) - A @ aim
+    change = np.zeros(aim.size)
+    if aim.size and (h > 0).any():
+        # imported here, because it is rarely needed
+        from scipy.optimize import nnls
+
+        E, one = np.vstack([A.T, h]), np.append(change, 1.0)
+        r = E @ nnls(E, one)[0] - one
+        change = -r[:-1] / r[-1]
+    return replace(s, x=s.x - M @ (aim + change))
+
+
 def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
     """Return the rows of polygons around discs, as arguments of `linprog`.
 
@@ -197,10 +238,14 @@ def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:
     return np.asarray(block_diag(*motions)), centres, size
 
 
-def _kernel(A: Floats) -> Floats:
-    """Return an orthonormal basis (k, r) of the kernel of A (m, k)."""
-    _, singular_values, Vt = np.linalg.svd(A, full_matrices=True)
-    rank = int((singular_values > 1e-9 * singular_values.max(initial=0.0)).sum())
+def _kernel(A: Floats, tolerance: float = 1e-9) -> Floats:
+    """Return an orthonormal basis (k, r) of the kernel of A (m, k).
+
+    tolerance : singular values below this fraction of the largest one count as zero
+    """
+    # the triangular factor has the same kernel, and at most k rows
+    _, singular_values, Vt = np.linalg.svd(np.linalg.qr(A, mode="r"))
+    rank = int((singular_values > tolerance * singular_values.max(initial=0.0)).sum())
     return np.asarray(Vt[rank:].T)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from scipy.sparse import csc_array, csr_array, eye_array
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.harness.mechanics import boundary_facets
-from mortarbench.problems.contact.rigid import NO_NODES, RigidBody
+from mortarbench.problems.contact.rigid import RigidBody
 from mortarbench.problems.fem.elasticity import (
     Material,
     Plane,
@@ -41,18 +42,17 @@ class ContactPair(NamedTuple):
     master: Nodes  #: master side; empty for a rigid master
     #: master that does not deform; None if the master is elastic
     rigid: RigidBody | None = None
-    clamped: Nodes = NO_NODES  #: slave nodes without a row against a rigid master
+    #: largest distance at which a slave node has a row, m; None selects the larger
+    #: extent of the two sides, or no limit for a rigid master
+    reach: float | None = None
 
     def renumbered(self, nodes: Nodes) -> ContactPair:
         """Return the pair in the numbering of a mesh that contains only `nodes`.
 
         nodes : (k,) ascending global numbers
         """
-        slave, master, clamped = (
-            np.searchsorted(nodes, part)
-            for part in (self.slave, self.master, self.clamped)
-        )
-        return ContactPair(slave, master, self.rigid, clamped)
+        slave, master = (np.searchsorted(nodes, part) for part in self.sides)
+        return self._replace(slave=slave, master=master)
 
     @property
     def sides(self) -> tuple[Nodes, Nodes]:
@@ -68,6 +68,11 @@ class ContactPair(NamedTuple):
     def nodes(self) -> Nodes:
         """Nodes of both sides, possibly with repetitions."""
         return np.concatenate([self.slave.ravel(), self.master.ravel()])
+
+
+def slave_places(pairs: Sequence[ContactPair]) -> int:
+    """Return the number of slave nodes of all pairs."""
+    return sum(pair.slave_nodes.size for pair in pairs)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -28,8 +28,7 @@ from mortarbench.harness import Friction, InputError, Vector
 from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.problems.contact.bodies import ContactSides, UnassembledBodies
-from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.contact.rows import ContactRows
 
 T = TypeVar("T")
 
@@ -95,15 +94,17 @@ def friction_of(
     owner = np.repeat(
         np.arange(len(laws)), [pair.slave_nodes.size for pair in bodies.pairs]
     )
-    place = rows.place[rows.row]
     bound, mu = (
-        np.array([getattr(law, name) for law in laws])[owner[place]]
+        np.array([getattr(law, name) for law in laws])[owner[rows.place]]
         for name in ("bound", "mu")
     )
-    cohesion = bound * rows.share[rows.row] / bodies.force
+    cohesion = rows.of_rows(bound * rows.share) / bodies.force
+    mu = rows.of_rows(mu * rows.share) / rows.of_rows(rows.share)
+    pressing = rows.of_rows(normal_forces[rows.place])
+    cohesion, mu, pressing = (v[rows.row] for v in (cohesion, mu, pressing))
     return Friction(
         T=rows.T,
-        bound=cohesion + mu * normal_forces[place],
+        bound=cohesion + mu * pressing,
         start=rows.T @ slip_origin,
         row=rows.row,
         cohesion=cohesion,
@@ -172,18 +173,3 @@ def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
             "last"
         )
     return problems[iterate - 1]
-
-
-def forces_at_nodes(normal: Vector, place: Nodes, places: int) -> Vector:
-    """Return the normal force (places,) of each slave node; zero if it has no row.
-
-    Parameters
-    ----------
-    normal : (m,) multipliers of the contact rows
-    place : (m,) slave node of each row, see `ContactRows`
-
-    """
-    force = np.zeros(places)
-    # clip negative multipliers of inexact solutions; bounds must not be negative
-    force[place] = np.maximum(normal, 0.0)
-    return force

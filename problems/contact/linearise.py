@@ -8,22 +8,31 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, vstack
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.contact.bodies import Bodies, ContactSides, UnassembledBodies
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    ContactSides,
+    UnassembledBodies,
+)
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_segment import (
-    ContactRows,
-    closest_points,
     geometric_stiffness,
     node_to_segment,
 )
 from mortarbench.problems.contact.rigid import rigid_rows
+from mortarbench.problems.contact.rows import ContactRows, joined
+from mortarbench.problems.contact.segment_search import Reach, closest_points
+from mortarbench.problems.contact.sides import pair_names
 from mortarbench.problems.contact.space.face_mortar import face_mortar
 from mortarbench.problems.contact.space.node_to_face import node_to_face
-from mortarbench.problems.contact.surface import current_positions, current_surface
+from mortarbench.problems.contact.surface import (
+    Points,
+    current_positions,
+    current_surface,
+)
 from mortarbench.problems.fem.mesh import Nodes
 
 #: mapping from the dimension to the functions that implement the methods "nts" and
@@ -43,7 +52,7 @@ def linearisation(
 ) -> Callable[[Vector], ContactRows]:
     """Return a function that maps a displacement (n,) in m to the rows of all pairs.
 
-    The returned function raises InputError at zero displacement if no pair has a row.
+    The returned function raises InputError at zero displacement if a pair has no row.
 
     contact : "nts" (node to segment, or node to face in 3D) or "mortar"; pairs with
         a rigid master have nodal rows
@@ -52,57 +61,76 @@ def linearisation(
     fixed_segments : (places,) segment of each slave node for node-to-segment contact,
         numbered as in `closest_segments`; −1 selects the closest segment at each u
     """
-    pairs = len(bodies.pairs)
     nodal, integral = METHODS[bodies.mesh.dim]
+    pairs, nodes = bodies.pairs, [pair.slave_nodes for pair in bodies.pairs]
     methods: list[Callable[..., ContactRows]] = [
-        nodal if contact == "nts" else partial(integral, basis=basis)
-    ] * pairs
+        rigid_rows
+        if pair.rigid is not None
+        else nodal
+        if contact == "nts"
+        else partial(integral, basis=basis, reach=Reach(distance=pair.reach))
+        for pair in pairs
+    ]
     if fixed_segments is not None:
         parts = _split_by_pair(bodies, fixed_segments)
         methods = [partial(node_to_segment, fixed_segments=part) for part in parts]
-    has_friction = [law.acts for law in laws] or [False] * pairs
+    size = float(np.ptp(bodies.mesh.points, axis=0).max())
+    has_friction = [law.acts for law in laws] or [False] * len(pairs)
 
     def linearise(u: Vector) -> ContactRows:
         parts = [
-            rows(bodies.mesh.points, u, *pair.sides, tangential=tangential)
-            if pair.rigid is None
-            else rigid_rows(
+            _within_reach(
+                rows(
+                    bodies.mesh.points,
+                    u,
+                    pair.slave,
+                    pair.master if pair.rigid is None else pair.rigid,
+                    tangential=tangential,
+                ),
                 bodies.mesh.points,
                 u,
-                pair.slave,
-                pair.rigid,
-                clamped=pair.clamped,
-                tangential=tangential,
+                pair,
             )
-            for rows, pair, tangential in zip(
-                methods, bodies.pairs, has_friction, strict=True
-            )
+            for rows, pair, tangential in zip(methods, pairs, has_friction, strict=True)
         ]
-        if not any(part.c.size for part in parts) and not u.any():
-            raise InputError(
-                "no node of a slave side faces its master within reach; expected two "
-                "sides that face each other, each with its body on the left (in 3D, "
-                "with outward normals)"
-            )
-        if len(parts) == 1:
-            return parts[0]
-        # rows and slave nodes are numbered pair by pair
-        first_row = np.cumsum([0, *(part.c.size for part in parts)])
-        first_place = np.cumsum([0, *(pair.slave_nodes.size for pair in bodies.pairs)])
-        return ContactRows(
-            B=csr_array(vstack([part.B for part in parts])),
-            c=np.concatenate([part.c for part in parts]),
-            T=csr_array(vstack([part.T for part in parts])),
-            row=np.concatenate(
-                [p.row + k for p, k in zip(parts, first_row, strict=False)]
-            ),
-            share=np.concatenate([part.share for part in parts]),
-            place=np.concatenate(
-                [p.place + k for p, k in zip(parts, first_place, strict=False)]
-            ),
-        )
+        if not u.any():
+            for name, pair, part in zip(pair_names(bodies), pairs, parts, strict=True):
+                _check_facing(name, pair, part, bodies.mesh.points)
+        return parts[0] if len(parts) == 1 else joined(parts, nodes, size)
 
     return linearise
+
+
+def _within_reach(
+    rows: ContactRows, points: Points, u: Vector, pair: ContactPair
+) -> ContactRows:
+    """Return the rows whose gaps at u are within the reach of the pair."""
+    distance = pair.reach
+    if distance is None and pair.rigid is None:
+        sides = (current_positions(points, u, side.ravel(), "") for side in pair.sides)
+        distance = max(float(np.linalg.norm(np.ptp(x, axis=0))) for x in sides)
+    if distance is None:
+        return rows
+    near = np.abs(rows.c - rows.B @ u) <= distance
+    return rows if near.all() else rows.selected(near)
+
+
+def _check_facing(
+    name: str, pair: ContactPair, rows: ContactRows, points: Points
+) -> None:
+    """Raise InputError if no row pushes the undeformed slave against its normal.
+
+    The angle may be up to 60°, as for the rays of mortar contact.
+    """
+    side = current_surface(points, np.zeros(points.size), pair.slave, "slave")
+    along = rows.resultants(pair.slave_nodes, points.shape[1])
+    outward = np.einsum("ex,ex->e", along, side.node_normal[rows.place])
+    if not (outward >= -Reach().cosine).any():
+        raise InputError(
+            f"contact {name}: no node of the slave side faces its master within reach; "
+            "expected two sides that face each other, each with its body on the left "
+            "(in 3D, with outward normals)"
+        )
 
 
 def contact_stiffness(
@@ -110,9 +138,9 @@ def contact_stiffness(
 ) -> Callable[[Vector, Vector], tuple[NDArray[np.float64], Nodes]]:
     """Return a function that evaluates the blocks −λ_i g_i''(u).
 
-    The arguments of this function are u (n,) in m and λ (m,) in N/m, and its result is
+    The arguments of this function are u (n,) in m and λ (s,) in N/m, and its result is
     that of `problems.contact.node_to_segment.geometric_stiffness` for all pairs.
-    Contact is node to segment, with one row per slave node.
+    Contact is node to segment, and λ has one entry per slave node.
 
     fixed_segments : see `linearisation`
     """

@@ -64,8 +64,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.segment_search import Reach, facing_segments
+from mortarbench.problems.contact.rows import ContactRows, without_outer
+from mortarbench.problems.contact.segment_search import (
+    Reach,
+    closest_points,
+    facing_segments,
+)
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
@@ -98,6 +102,7 @@ class Mortar:
     M: csr_array  #: (s, 2v) ∫ Φ_j N^m_l ν, m
     gap: Vector  #: (s,) g̃_j = ∫ Φ_j |ν| g, m²
     cover: Vector  #: (s,) ∫ N_j |ν|, m; 0 for nodes that the master does not cover
+    covered: Vector  #: (s,) ∫ N_j over the covered part, m
 
 
 class Overlaps(NamedTuple):
@@ -129,6 +134,7 @@ def mortar(
     basis: Basis = "dual",
     reach: Reach = Reach(),  # noqa: B008 - frozen
     tangential: bool = False,
+    part: NDArray[np.bool_] | None = None,
 ) -> ContactRows:
     """Linearise the weak non-penetration condition at u, with a row per covered node.
 
@@ -142,6 +148,7 @@ def mortar(
         the angle, rays can graze a distant master side. Weighted gaps between separate
         bodies could then be negative, because dual basis functions take negative values
     tangential : add tangential rows for friction
+    part : mask (f,) of the slave facets over which to integrate; None selects all
 
     Raises
     ------
@@ -151,18 +158,21 @@ def mortar(
     """
     s = current_surface(points, u, slave, "slave")
     m = current_surface(points, u, master, "master")
-    integrals = integrate(s, m, basis, reach)
+    integrals = integrate(s if part is None else s.part(part), m, basis, reach)
     j = np.flatnonzero(integrals.cover)
     B = _rows(integrals, j, (slave, master), points.shape)
     T = _rotated(B if tangential else B[:0])
-    return ContactRows(
+    rows = ContactRows(
         B,
         integrals.gap[j] / integrals.cover[j] + B @ u,
         T,
         np.arange(T.shape[0]),
         integrals.cover[j],
         j,
+        integrals.covered[j] / s.areas[j],
+        np.arange(j.size),
     )
+    return without_outer(rows, s, closest_points(s.x, m).beyond)
 
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:
@@ -193,6 +203,7 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
         _sum(M, j, k, (s, v)),
         _gather(gap, j, s),
         _gather(cover, j, s),
+        _gather(np.einsum("pgj,pg->pj", N, gauss.weight), j, s),
     )
 
 

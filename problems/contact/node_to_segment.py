@@ -19,8 +19,7 @@ Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
 The friction forces are −Tᵀλ_t, by analogy with the contact forces −Bᵀλ.
 
-For slave nodes beyond an end of the master, the closest point is the node at this end,
-and n is the normal of the segment at this end.
+For slave nodes beyond an end of the master, see `problems.contact.rows`.
 
 A slave node can be assigned to a fixed segment. The node then stays on the outer side
 of the whole line through this segment, irrespective of its closest point. Newton's
@@ -31,51 +30,34 @@ between iterations.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.segment_search import nearest
+from mortarbench.problems.contact.mortar import mortar
+from mortarbench.problems.contact.rows import (
+    ContactRows,
+    Feet,
+    SlaveNodes,
+    nodal_rows,
+)
+from mortarbench.problems.contact.segment_search import (
+    ClosestPoints,
+    along_lines,
+    closest_points,
+)
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
     current_positions,
     current_surface,
+    surface,
     tangents,
 )
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
-
-#: closest points within this distance in ξ of an end of a segment are moved to this end
-VERTEX_TOLERANCE = 1e-9
-
-
-class ContactRows(NamedTuple):
-    """Contact rows B u ≤ c for the total displacement u, and rows of the slip T u."""
-
-    B: csr_array  #: (m_I, n) B_M of eq. (5), dimensionless
-    c: Vector  #: (m_I,) c_M of eq. (5), m
-    T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row with friction
-    row: Nodes  #: (k,) contact row of each tangential row
-    #: (m_I,) ∫N_j over the slave side (for mortar contact, over its covered part, and
-    #: with the weight |ν| in 2D), the length in m (2D) or the area in m² (3D) that is
-    #: assigned to the row
-    share: Vector
-    #: (m_I,) index of the slave node of each row in `ContactPair.slave_nodes`
-    place: Nodes
-
-
-class ClosestPoints(NamedTuple):
-    """Closest points of s positions on a chain of nodes."""
-
-    #: (s,) position in the chain of the first node of the segment that contains the
-    #: closest point
-    segment: Nodes
-    xi: Vector  #: (s,) coordinate on the segment, 0 at its first node, 1 at its second
-    normal: Points  #: (s, 2) outward unit normal of the master at the closest point
 
 
 def node_to_segment(
@@ -89,8 +71,8 @@ def node_to_segment(
 ) -> ContactRows:
     """Linearise the non-penetration condition of all slave nodes at u.
 
-    The result has one contact row per slave node. B, c and T are defined in the module
-    docstring.
+    The result has one contact row per slave node, except for nodes beyond an end of the
+    master. B, c and T are defined in the module docstring.
 
     Parameters
     ----------
@@ -114,21 +96,17 @@ def node_to_segment(
     N = np.stack([1 - closest.xi, closest.xi], axis=1)
     ends = np.stack([closest.segment, closest.segment + 1], axis=1)
     foot = np.einsum("sa,sax->sx", N, line.x[ends])
-    gap = np.einsum("sx,sx->s", x - foot, closest.normal)
-
-    # (m, 3) stencil of each row: the slave node and both ends of the segment
-    node = np.column_stack([slave, master[ends]])
-    weight = np.column_stack([-np.ones(len(slave)), N])
-    B = rows_along(node, weight, closest.normal, points.size)
-    # friction rows have the weights of their contact row, along the tangents
-    T, row = csr_array((0, points.size)), np.arange(0)
-    if tangential:
-        directions = tangents(closest.normal)
-        row = np.repeat(np.arange(slave.size), directions.shape[1])
-        along = directions.reshape(-1, points.shape[1])
-        T = rows_along(node[row], weight[row], along, points.size)
-    place = np.arange(slave.size)
-    return ContactRows(B, gap + B @ u, T, row, nodal_lengths(x), place)
+    radius = line.radius[closest.segment]
+    return nodal_rows(
+        u,
+        SlaveNodes(slave, x, nodal_lengths(x)),
+        Feet(master[ends], N, foot, closest.normal, closest.beyond, radius),
+        lambda: surface(x, "slave"),
+        partial(
+            mortar, points, u, slave, master, basis="standard", tangential=tangential
+        ),
+        tangential=tangential,
+    )
 
 
 def geometric_stiffness(
@@ -193,54 +171,30 @@ def geometric_stiffness(
     return blocks, dofs_of(nodes, 2).reshape(-1, 6)
 
 
-def closest_points(x: Points, line: Surface) -> ClosestPoints:
-    """Return the closest points of x (s, 2) on a chain, with outward normals."""
-    segment, xi = nearest(x, line)
-    first, second = line.facets.T[:, segment]
-    # snap to vertices, where the normal is averaged: rounding must not select a segment
-    at_first, at_second = xi <= VERTEX_TOLERANCE, xi >= 1 - VERTEX_TOLERANCE
-    xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
-    normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
-    normal = np.where(at_second[:, None], line.node_normal[second], normal)
-    return ClosestPoints(first, xi, normal)
-
-
 def _projections(
     x: Points, line: Surface, fixed_segments: Nodes | None
 ) -> ClosestPoints:
-    """Return closest points of slave nodes x (s, 2) on the master.
+    """Return closest points of slave nodes x (s, 2) on the master, possibly extended.
 
-    A node with a fixed segment is projected onto the line through this segment, where ξ
-    may be outside [0, 1].
+    A node with a fixed segment, or beyond an end of the master, is projected onto the
+    line through its segment, where ξ may be outside [0, 1].
     """
     closest = closest_points(x, line)
-    if fixed_segments is None or not (is_fixed := fixed_segments >= 0).any():
+    segment, beyond = closest.segment, closest.beyond
+    extended = beyond > 0
+    if fixed_segments is not None:
+        is_fixed = fixed_segments >= 0
+        segment = np.where(is_fixed, fixed_segments, segment)
+        beyond = np.where(is_fixed, 0.0, beyond)
+        extended |= is_fixed
+    if not extended.any():
         return closest
-    segment = np.where(is_fixed, fixed_segments, closest.segment)
-    start = line.x[segment]
-    edge = line.x[segment + 1] - start
-    xi = np.einsum("sx,sx->s", x - start, edge) / np.einsum("sx,sx->s", edge, edge)
-    length = np.linalg.norm(edge, axis=1)[:, None]
-    across = -tangents(edge)[:, 0] / length
+    xi, length = along_lines(x, line, segment)
+    edge = line.x[segment + 1] - line.x[segment]
+    across = -tangents(edge)[:, 0] / length[:, None]
     return ClosestPoints(
         segment,
-        np.where(is_fixed, xi, closest.xi),
-        np.where(is_fixed[:, None], across, closest.normal),
+        np.where(extended, xi, closest.xi),
+        np.where(extended[:, None], across, closest.normal),
+        beyond,
     )
-
-
-def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:
-    """Assemble rows of weighted displacements along a direction, (m, size).
-
-    Row r has the entries weight_ra · direction_r at the components of node_ra, for
-    `node` and `weight` (m, k) and `direction` (m, dim). Zeros are not stored.
-    """
-    (m, k), dim = node.shape, direction.shape[1]
-    if not m:
-        return csr_array((0, size))
-    values = weight[:, :, None] * direction[:, None, :]
-    indptr = dim * k * np.arange(m + 1)
-    B = csr_array((values.ravel(), dofs_of(node, dim), indptr), shape=(m, size))
-    B.sum_duplicates()
-    B.eliminate_zeros()
-    return B

@@ -13,12 +13,14 @@ from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.harness.sets.blocks import norms
 from mortarbench.problems.contact.bodies import Bodies, ContactSides
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.contact.sides import (
     ACTIVE_THRESHOLD,
     active,
     bodies_of,
     contact_sides,
     states,
+    undetermined_friction,
 )
 from mortarbench.problems.fem.mesh import as_vectors
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
@@ -43,6 +45,7 @@ def quantities(
     bodies: Bodies,
     primal: QP,
     s: Solution,
+    rows: ContactRows,
     friction: Friction = NO_FRICTION,
     stresses: Mapping[str, Vector] | None = None,
 ) -> dict[str, Any]:
@@ -59,7 +62,7 @@ def quantities(
         energy=primal.objective(s.x) * bodies.force * l,
         max_von_mises=[stress[owner == b].max() for b in range(len(bodies.names))],
     )
-    return results_of(bulk, bodies, primal, s, friction)
+    return results_of(bulk, bodies, primal, s, rows, friction)
 
 
 def results_of(
@@ -67,6 +70,7 @@ def results_of(
     bodies: Bodies | ContactSides,
     primal: QP,
     s: Solution,
+    rows: ContactRows,
     friction: Friction = NO_FRICTION,
 ) -> dict[str, Any]:
     """Return counts, energy, contact forces and stresses by name.
@@ -81,8 +85,8 @@ def results_of(
 
     Parameters
     ----------
-    bodies, primal, s, friction : data of all nodes, or of the nodes of contact sides
-        alone; with friction, the diagonal of P is used
+    bodies, primal, s, rows, friction : data of all nodes, or of the nodes of contact
+        sides alone; with friction, the diagonal of P is used
 
     """
     forces = contact_forces(bodies, primal, s, friction)
@@ -101,7 +105,7 @@ def results_of(
             name: float(largest)
             for name, largest in zip(bodies.names, bulk.max_von_mises, strict=True)
         },
-        "contacts": pair_results(bodies, primal, s, friction),
+        "contacts": pair_results(bodies, primal, s, rows, friction),
     } | (
         friction_quantities(bodies, primal, s, friction) if friction.bound.size else {}
     )
@@ -127,7 +131,9 @@ def friction_quantities(
     """Return counts of friction states, the residual of Coulomb's law and dissipation.
 
     `open`, `stick` and `slip` are the numbers of frictional contact rows that are
-    inactive, active and sticking, and active and slipping, see `states`.
+    inactive, active and sticking, and active and slipping, see `states`. `undetermined`
+    is the number of dependent rows among those that stick, and is omitted if it is 0;
+    friction forces are otherwise not unique, see `undetermined_friction`.
     `sliding_without_contact` is the number of inactive rows with shear, which Tresca's
     law allows; these rows do not count as open. `shear_without_contact` is the fraction
     of Σ‖λ_t‖ that acts on these rows. `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for
@@ -138,7 +144,9 @@ def friction_quantities(
     shear = norms(s.z[primal.h.size :][friction.vectors])
     without_contact = state == SLIDING
     shear_alone = float(shear[without_contact].sum() / (shear.sum() or 1.0))
+    undetermined = undetermined_friction(primal, s, friction)
     return {
+        **({"undetermined": undetermined} if undetermined else {}),
         **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},
         "sliding_without_contact": int(without_contact.sum()),
         "shear_without_contact": shear_alone,
@@ -151,20 +159,22 @@ def pair_results(
     bodies: Bodies | ContactSides,
     primal: QP,
     s: Solution,
+    rows: ContactRows,
     friction: Friction = NO_FRICTION,
 ) -> dict[str, dict[str, Any]]:
     """Return the results of each contact pair by its name.
 
-    `force` is the force on each elastic body of the pair in N/m; `largest_pressure` is
-    the largest nodal pressure on the slave in Pa; `smallest_gap` in m is negative if
-    bodies overlap, and None if no slave node has a row; `half_width` is half the
-    undeformed length in m of the slave side under pressure (in 3D, `pressed_area` is
-    its area in m²). With friction, `friction_force` is the contribution of friction to
-    the force on the slave in N/m, and `stick` and `slip` are the numbers of sticking
-    and slipping slave nodes.
+    `force` is the force on each elastic body of the pair in N/m; `active` is the number
+    of slave nodes under pressure; `largest_pressure` is the largest nodal pressure on
+    the slave in Pa, and `mean_pressure` its mean over the part of the slave under
+    pressure; `smallest_gap` in m is negative if bodies overlap, and None if no slave
+    node has a row; `half_width` is half the undeformed length in m of the part under
+    pressure (in 3D, `pressed_area` is its area in m²). With friction, `friction_force`
+    is the contribution of friction to the force on the slave in N/m, and `stick` and
+    `slip` are the numbers of sticking and slipping slave nodes.
     """
     results = {}
-    sides = contact_sides(bodies, primal, s, friction)
+    sides = contact_sides(bodies, primal, s, rows, friction)
     for pair, side in zip(bodies.pairs, sides, strict=True):
         slave, master = bodies_of(bodies, pair)
         total = side.force.sum(axis=0)
@@ -173,10 +183,14 @@ def pair_results(
             # 0.0 − x avoids negative zeros
             force = {master: (0.0 - total).tolist()} | force
         largest = float(np.hypot.reduce(side.force, axis=1).max(initial=0.0))
-        pressed = float(side.length[side.pressed(ACTIVE_THRESHOLD * largest)].sum())
+        mask = side.pressed(ACTIVE_THRESHOLD * largest)
+        pressed = float(side.length[mask].sum())
+        push = float((side.pressure * side.length)[mask].sum())
         results[side.name] = {
             "force": force,
+            "active": int(mask.sum()),
             "largest_pressure": float(side.pressure.max()),
+            "mean_pressure": push / pressed if pressed else 0.0,
             "smallest_gap": (
                 None if np.isnan(side.gap).all() else float(np.nanmin(side.gap))
             ),
@@ -199,6 +213,7 @@ def fields(
     bodies: Bodies,
     primal: QP,
     s: Solution,
+    rows: ContactRows,
     friction: Friction = NO_FRICTION,
     stresses: Mapping[str, Vector] | None = None,
     subdomains: NDArray[np.int64] | None = None,
@@ -219,7 +234,7 @@ def fields(
         nodal=stresses or nodal_stresses(bodies, u),
         contact_nodes=slaves,
         contact_forces=contact_forces(bodies, primal, s, friction)[slaves],
-        contacts=contact_sides(bodies, primal, s, friction),
+        contacts=contact_sides(bodies, primal, s, rows, friction),
         subdomains=subdomains,
     )
 

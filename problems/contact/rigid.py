@@ -20,7 +20,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.contact.surface import (
     Points,
     current_positions,
@@ -28,8 +28,6 @@ from mortarbench.problems.contact.surface import (
     tangents,
 )
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
-
-NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 
 
 class RigidBody(Protocol):
@@ -94,7 +92,6 @@ def rigid_rows(
     side: Nodes,
     rigid: RigidBody,
     *,
-    clamped: Nodes = NO_NODES,
     tangential: bool = False,
 ) -> ContactRows:
     """Return the contact rows of a side against a rigid body, linearised at u.
@@ -104,7 +101,6 @@ def rigid_rows(
     points : (N, dim) reference positions X, m
     u : (n,) displacement u^k at which to linearise, m
     side : nodes or faces of the side, a boundary of a `Mesh`
-    clamped : nodes of the side whose components are all prescribed; they have no row
     tangential : add tangential rows for friction
 
     Raises
@@ -115,11 +111,9 @@ def rigid_rows(
 
     """
     dim, nodes = points.shape[1], side if side.ndim == 1 else np.unique(side)
-    place = np.flatnonzero(~np.isin(nodes, clamped))
-    node = nodes[place]
-    gap, normal = rigid.gap(current_positions(points, u, node, "slave"))
-    m, components = node.size, dofs_of(node, dim).reshape(-1, dim)
-    along = -tangents(normal)[: m if tangential else 0]
+    gap, normal = rigid.gap(current_positions(points, u, nodes, "slave"))
+    components, every = dofs_of(nodes, dim).reshape(-1, dim), np.arange(nodes.size)
+    along = -tangents(normal)[: nodes.size if tangential else 0]
     row = np.repeat(np.arange(len(along)), dim - 1)
     reference = current_surface(points, np.zeros_like(u), side, "slave")
     return ContactRows(
@@ -127,8 +121,10 @@ def rigid_rows(
         c=gap - np.einsum("sx,sx->s", normal, u[components]),
         T=_rows(along.reshape(-1, dim), components[row], points.size),
         row=row,
-        share=reference.areas[place],
-        place=place,
+        share=reference.areas,
+        place=every,
+        covered=np.ones(nodes.size),
+        at=every,
     )
 
 

@@ -31,6 +31,10 @@ from mortarbench.problems.contact.surface import Points, Surface, tangents
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes
 
+#: closest points within this distance in ξ of an end of a segment are moved to this end
+VERTEX_TOLERANCE = 1e-9
+
+
 BRANCHES = 4
 ROOTS = 16  #: largest number of sub-chains on the top level; smaller values are slower
 #: relative tolerance for rounding of distances; without it, equally close segments
@@ -85,6 +89,18 @@ class Nearest(NamedTuple):
     xi: Vector  #: (s,) coordinate on the segment, 0 at its first node, 1 at its second
 
 
+class ClosestPoints(NamedTuple):
+    """Closest points of s positions on a chain of nodes."""
+
+    #: (s,) position in the chain of the first node of the segment that contains the
+    #: closest point
+    segment: Nodes
+    xi: Vector  #: (s,) coordinate on the segment, 0 at its first node, 1 at its second
+    normal: Points  #: (s, 2) outward unit normal of the master at the closest point
+    #: (s,) distance along the master by which a point is beyond its end, m; else 0
+    beyond: Vector
+
+
 def nearest(x: Points, line: Surface) -> Nearest:
     """Return the closest point of a chain to each point of x (s, 2).
 
@@ -103,6 +119,34 @@ def nearest(x: Points, line: Surface) -> Nearest:
     query, closest = _descend(len(x), levels, keep)
     segment = closest[_first_of_each(query)]
     return Nearest(segment, _to_chords(x, levels[-1], segment)[0])
+
+
+def closest_points(x: Points, line: Surface) -> ClosestPoints:
+    """Return the closest points of x (s, 2) on a chain, with outward normals."""
+    segment, xi = nearest(x, line)
+    first, second = line.facets.T[:, segment]
+    # snap to vertices, where the normal is averaged: rounding must not select a segment
+    at_first, at_second = xi <= VERTEX_TOLERANCE, xi >= 1 - VERTEX_TOLERANCE
+    xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
+    normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
+    normal = np.where(at_second[:, None], line.node_normal[second], normal)
+    along, length = along_lines(x, line, first)
+    starts = at_first & (segment == 0)
+    ends = at_second & (segment == len(line.facets) - 1)
+    excess = np.where(starts, -along, np.where(ends, along - 1, 0.0))
+    excess = np.where(excess > VERTEX_TOLERANCE, excess, 0.0)
+    return ClosestPoints(first, xi, normal, excess * length)
+
+
+def along_lines(x: Points, line: Surface, segment: Nodes) -> tuple[Vector, Vector]:
+    """Project x (s, 2) onto the lines through segments; return ξ and the lengths.
+
+    segment : (s,) position in the chain of the first node of each segment
+    """
+    edge = line.x[segment + 1] - line.x[segment]
+    square = np.einsum("sx,sx->s", edge, edge)
+    xi = np.einsum("sx,sx->s", x - line.x[segment], edge) / square
+    return np.asarray(xi), np.sqrt(square)
 
 
 def facing_segments(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:

@@ -1,32 +1,32 @@
-"""Contact results along the slave side of each pair: forces, pressures, gaps, states.
-
-The rows of the primal QP are ordered pair by pair, and along the slave side within a
-pair. A pair with a rigid master has one row per slave node that is not clamped. Any
-other row is assigned to the first pair whose two sides contain all nodes of the row;
-the search starts at the pair of the preceding row. If two pairs share nodes on both
-sides, rows on these nodes are therefore assigned to the first of these pairs.
-"""
+"""Contact results along slave sides: forces, pressures, gaps and friction states."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array, diags_array, vstack
 
 from mortarbench.harness import QP, ContactSide, Friction, Solution, Vector
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.harness.sets.blocks import norms
-from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
-from mortarbench.problems.contact.surface import current_surface, unit
-from mortarbench.problems.fem.mesh import (
-    Nodes,
-    as_vectors,
-    dofs_of,
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    ContactSides,
+    UnassembledBodies,
 )
+from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.contact.surface import current_surface
+from mortarbench.problems.fem.mesh import as_vectors
 
 RIGID = "rigid"  #: name of a rigid master
 ACTIVE_THRESHOLD = 1e-6  #: a contact row is active where λ_i > ACTIVE_THRESHOLD·max λ
+#: largest slip that counts as zero, relative to the largest displacement
+NO_SLIP = 1e-12
+#: pivots of the Gram matrix of unit rows up to this value belong to dependent rows; the
+#: matrix is regularised by the square of this value
+DEPENDENT = 1e-8
 _STATE = f"U{len(SLIDING)}"  #: dtype of arrays of states; SLIDING is the longest name
 
 
@@ -34,66 +34,77 @@ def contact_sides(
     bodies: Bodies | ContactSides,
     primal: QP,
     s: Solution,
+    rows: ContactRows,
     friction: Friction = NO_FRICTION,
 ) -> tuple[ContactSide, ...]:
     """Return forces, pressures and gaps along the slave side of each pair, in SI units.
 
-    The nodal force is the sum of the contact and friction forces on a slave node. The
-    pressure is the component of the contact force against the outward normal of the
-    deformed side, divided by the undeformed length ∫N_j (in 3D, area) that belongs
-    to the node. The gap is the slack c − Bu of the row of the node; with mortar
-    contact, it is the mean gap around the node, weighted as in the row.
+    The nodal force is the sum of the contact and friction forces of the pair on a slave
+    node. The pressure is the force of the node's row on the slave, against the outward
+    normal of the deformed side, divided by the part of the undeformed length (in 3D,
+    area) ∫N_j that the master covers. For the basis N_j of mortar contact, it is the
+    nodal value of the traction. The gap is the slack c − Bu of the row of the node;
+    with mortar contact, it is the mean gap around the node, weighted as in the row.
 
-    With friction, the shear is the friction force along the tangent (−n_y, n_x),
-    divided by the same length; in 3D, it is the norm of the friction force, divided
-    by the area. A node with a row has one of the `states`; the state of a node without
-    a row is the empty string.
+    With friction, the shear is the multiplier of the friction row, along the tangent
+    (−n_y, n_x) and divided by the same length; in 3D, it is the norm of the two
+    multipliers, divided by the area. A node with a row has one of the `states`; the
+    state of a node without a row is the empty string.
+
+    rows : the rows of `primal` and `friction`
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
-    tangential, state = s.z[primal.h.size :], states(primal, s, friction)
+    normal, tangential = np.split(s.z * F, [primal.h.size])
     points, dim, u = bodies.mesh.points, bodies.mesh.dim, s.x * l
-    row = friction.row[friction.vectors[:, 0]]  # contact row of each state
-    slack = (primal.h - B @ s.x) * l
+    slaves = [pair.slave_nodes for pair in bodies.pairs]
+    first = np.cumsum([0, *(nodes.size for nodes in slaves)])
+    owner, places = np.repeat(np.arange(len(slaves)), np.diff(first)), int(first[-1])
+    # results of each contact row, then of each slave node
+    row = friction.row[friction.vectors[:, 0]]
+    state, shear = np.full(normal.size, "open", dtype=_STATE), np.zeros(normal.size)
+    state[row] = states(primal, s, friction)
+    vectors = tangential[friction.vectors]
+    shear[row] = 0.0 - vectors[:, 0] if dim == 2 else norms(vectors)
+    push, shear = rows.at_places(normal, places), rows.at_places(shear, places)
+    gap, covered = np.full(places, np.nan), np.ones(places)
+    gap[rows.place] = ((primal.h - B @ s.x) * l)[rows.at]
+    covered[rows.place] = rows.covered
+    nodal_state = np.full(places, "", dtype=_STATE)
+    nodal_state[rows.place] = state[rows.at]
     sides = []
-    for name, pair, rows in zip(
-        pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
+    for k, (name, pair) in enumerate(
+        zip(pair_names(bodies), bodies.pairs, strict=True)
     ):
+        slave, here = slaves[k], slice(first[k], first[k + 1])
+        # fraction (m,) of each row's force that belongs to this pair
+        mine = owner[rows.place] == k
+        own = rows.of_rows(rows.share * mine) / rows.of_rows(rows.share)
         # 0.0 − x instead of −x avoids negative zeros in reports
-        slave = pair.slave_nodes
-        contact_force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[slave]
-        own = (friction.row >= rows.start) & (friction.row < rows.stop)
-        shearing = np.zeros_like(contact_force)
-        if own.any():
-            force = friction.T[own].T @ tangential[own]
-            shearing -= as_vectors(force, dim)[slave] * F
-        side = current_surface(points, u, pair.slave, "slave")
-        length = current_surface(points, np.zeros_like(u), pair.slave, "slave").areas
-        normal = np.einsum("sx,sx->s", contact_force, side.node_normal)
-        gap, push = np.full((2, len(slave)), np.nan)
-        # nodes without a row keep the gap NaN
-        place, direction = slave_places(B[rows], slave, dim)
-        gap[place] = slack[rows]
-        push[place] = np.einsum("rx,rx->r", contact_force[place], -direction)
-        push = np.nan_to_num(push)
-        nodal_state = np.full(len(slave), "", dtype=state.dtype)
-        nodal_state[place] = "open"
-        here = (row >= rows.start) & (row < rows.stop)
-        nodal_state[place[row[here] - rows.start]] = state[here]
-        along = side.tangents[:, 0] if dim == 2 else unit(shearing, 0 * shearing)
+        force = as_vectors(0.0 - B.T @ (normal * own), dim)[slave]
+        slipping = own[friction.row]  # (k,) the same for friction rows
+        acts = bool(slipping.any())
+        shearing = np.zeros_like(force)
+        if acts:
+            shearing -= as_vectors(friction.T.T @ (tangential * slipping), dim)[slave]
+        area = current_surface(points, 0 * u, pair.slave, "slave").areas * covered[here]
+        outward = current_surface(points, u, pair.slave, "slave").node_normal
+        along, place = rows.resultants(slave, dim)[rows.at[mine]], rows.place[mine]
+        pressing = np.zeros(slave.size)
+        pressing[place - first[k]] = push[place] * np.einsum(
+            "ex,ex->e", along, outward[place - first[k]]
+        )
         sides.append(
             ContactSide(
                 name=name,
                 nodes=slave,
-                length=length,
-                force=contact_force + shearing,
-                pressure=(0.0 - normal) / length,
-                gap=gap,
-                push=push,
-                shear=np.einsum("sx,sx->s", shearing, along) / length
-                if own.any()
-                else None,
-                friction=nodal_state if own.any() else None,
-                friction_force=shearing if own.any() else None,
+                length=area,
+                force=force + shearing,
+                pressure=pressing / area,
+                gap=gap[here],
+                push=push[here],
+                shear=shear[here] / area if acts else None,
+                friction=nodal_state[here] if acts else None,
+                friction_force=shearing if acts else None,
             )
         )
     return tuple(sides)
@@ -112,17 +123,54 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
     if not vectors.size:
         return np.zeros(0, dtype=_STATE)
     normal, tangential = np.split(s.z, [primal.h.size])
-    diagonal = csr_array(primal.P).diagonal()
-    # T diag(K)⁻¹ Tᵀ of each row, with stiffness 1 for components without stiffness
-    softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
-    shear, first = norms(tangential[vectors]), vectors[:, 0]
-    room = (friction.bound[first] - shear) * softness[vectors].mean(axis=1)
-    sticks = room >= norms(friction.slip(s.x))
-    closed = active(normal)[friction.row[first]]
+    shear = norms(tangential[vectors])
+    sticks = _room(primal, s, friction) >= norms(friction.slip(s.x))
+    closed = active(normal)[friction.row[vectors[:, 0]]]
     sheared = shear > ACTIVE_THRESHOLD * np.abs(s.z).max(initial=0.0)
     apart = np.where(sheared, SLIDING, "open")
     touching = np.where(sticks, "stick", "slip")
     return np.where(closed, touching, apart).astype(_STATE)
+
+
+def _room(primal: QP, s: Solution, friction: Friction) -> Vector:
+    """Return the slip (v,) up to which tangential vectors stick, see `states`."""
+    vectors, diagonal = friction.vectors, csr_array(primal.P).diagonal()
+    # T diag(K)⁻¹ Tᵀ of each row, with stiffness 1 for components without stiffness
+    softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
+    shear = norms(s.z[primal.h.size :][vectors])
+    room = friction.bound[vectors[:, 0]] - shear
+    return np.asarray(room * softness[vectors].mean(axis=1))
+
+
+def undetermined_friction(primal: QP, s: Solution, friction: Friction) -> int:
+    """Return the dimension of the multipliers of sticking rows that change no force.
+
+    The rows of closed contact and of sticking vectors are restricted to the components
+    that supports leave free. Combinations of these rows that vanish have no effect on
+    the displacement; those of contact rows alone are not counted.
+    """
+    slip, size = norms(friction.slip(s.x)), np.abs(s.x).max(initial=0.0)
+    sticks = slip <= np.maximum(_room(primal, s, friction), NO_SLIP * size)
+    sticks &= friction.bound[friction.vectors[:, 0]] > 0
+    B = csr_array(primal.G)[active(s.z[: primal.h.size])]
+    T = friction.T[friction.vectors[sticks].ravel()]
+    free = np.ones(s.x.size)
+    free[csr_array(primal.A).indices] = 0.0
+    every = csr_array(vstack([B, T]) @ diags_array(free))
+    return _defect(every) - _defect(every[: B.shape[0]])
+
+
+def _defect(rows: csr_array) -> int:
+    """Return the number of rows (m, n) that depend on the others."""
+    if not rows.shape[0]:
+        return 0
+    length = np.sqrt(rows.multiply(rows).sum(axis=1))
+    rows = csr_array(diags_array(1 / np.where(length > 0, length, 1.0)) @ rows)
+    # imported here, because only friction needs it
+    from sksparse.cholmod import cholesky
+
+    pivots = cholesky(csc_array(rows @ rows.T), beta=DEPENDENT**2).D()
+    return int((pivots <= DEPENDENT).sum())
 
 
 def active(normal: Vector) -> NDArray[np.bool_]:
@@ -130,7 +178,7 @@ def active(normal: Vector) -> NDArray[np.bool_]:
     return np.asarray(normal > ACTIVE_THRESHOLD * normal.max(initial=0.0))
 
 
-def pair_names(bodies: Bodies | ContactSides) -> list[str]:
+def pair_names(bodies: UnassembledBodies | ContactSides) -> list[str]:
     """Return the names "SLAVE on MASTER" of all pairs; repetitions get a number > 1."""
     names: list[str] = []
     for pair in bodies.pairs:
@@ -141,48 +189,10 @@ def pair_names(bodies: Bodies | ContactSides) -> list[str]:
     return names
 
 
-def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, str]:
+def bodies_of(
+    bodies: UnassembledBodies | ContactSides, pair: ContactPair
+) -> tuple[str, str]:
     """Return the names of the bodies of slave and master."""
     owner = bodies.body_of_node
     master = bodies.names[owner[pair.master.flat[0]]] if pair.master.size else RIGID
     return bodies.names[owner[pair.slave.flat[0]]], master
-
-
-def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
-    """Return, for each pair, the slice of its rows in B (m, n)."""
-    m, (N, dim) = B.shape[0], bodies.mesh.points.shape
-    # (m, N) nodes of each row, and for each pair a mask of the rows with other nodes
-    touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
-    slices, first = [], 0
-    for pair in bodies.pairs:
-        if pair.rigid is not None:
-            end = first + pair.slave_nodes.size - pair.clamped.size
-        else:
-            # the rows of the pair end before the first row with a node outside both
-            # sides, or the first row against a rigid master, which has slave nodes only
-            other, opposite = np.ones(N), np.zeros(N)
-            other[pair.nodes] = 0.0
-            opposite[pair.master if pair.master.size else pair.slave] = 1.0
-            outside = (touches @ other > 0) | (touches @ opposite == 0)
-            beyond = np.flatnonzero(outside[first:])
-            end = first + int(beyond[0]) if beyond.size else m
-        slices.append(slice(first, end))
-        first = end
-    return slices
-
-
-def slave_places(
-    B: csr_array, slave: Nodes, dim: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the slave node of each row: the node of `slave` with the largest entries.
-
-    Returns
-    -------
-    positions (r,) in `slave`, and unit vectors (r, dim) along the entries of that node
-
-    """
-    components = [B[:, dofs_of(slave, dim, axis)] for axis in range(dim)]
-    entries = np.stack([part.toarray() for part in components], axis=-1)
-    place = np.abs(entries).sum(axis=2).argmax(axis=1)
-    entry = entries[np.arange(len(place)), place]
-    return place, entry / np.linalg.norm(entry, axis=1, keepdims=True)

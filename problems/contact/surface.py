@@ -6,7 +6,7 @@ cells.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,33 @@ class Surface:
         if self.x.shape[1] == 2:
             return nodal_lengths(self.x)
         return nodal_areas(self.x, self.facets)[1]
+
+    @property
+    def radius(self) -> Vector:
+        """Largest distance of a corner from the centre of a facet of each node (v,), m.
+
+        In 2D, this is half the length of the longer segment.
+        """
+        corners, radius = self.x[self.facets], np.zeros(len(self.x))
+        offset = corners - corners.mean(axis=1, keepdims=True)
+        largest = np.linalg.norm(offset, axis=2).max(axis=1)
+        np.maximum.at(radius, self.facets, largest[:, None])
+        return radius
+
+    def areas_in(self, part: NDArray[np.bool_]) -> Vector:
+        """Return ∫N_j (v,) over the facets in a mask (f,); see `areas`."""
+        areas = np.zeros(len(self.x))
+        if self.x.shape[1] == 2:
+            half = np.linalg.norm(self.end - self.start, axis=1)[part] / 2
+            np.add.at(areas, self.facets[part], half[:, None])
+        else:
+            nodes, values = nodal_areas(self.x, self.facets[part])
+            areas[nodes] = values
+        return areas
+
+    def part(self, facets: NDArray[np.bool_]) -> Surface:
+        """Return the facets in a mask (f,), with the nodes and normals of the side."""
+        return replace(self, facets=self.facets[facets], normal=self.normal[facets])
 
     @property
     def extent(self) -> float:

@@ -23,8 +23,10 @@ from mortarbench.harness import (
     Vector,
 )
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.problems.contact.balance import least_motion
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality.decomposed import cached_layout, decompose
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise, primal_form
 from mortarbench.problems.duality.feti_dual import (
@@ -76,14 +78,15 @@ def case_of(
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
-        solution = MonolithicSolution(
-            InterfaceState(bodies, primal, s, friction), bodies, count
-        )
-        return {**quantities(bodies, primal, s, friction), **problem.results(solution)}
+        state = InterfaceState(bodies, primal, s, whole.rows, friction)
+        solution = MonolithicSolution(state, bodies, count)
+        values = quantities(bodies, primal, s, whole.rows, friction)
+        return {**values, **problem.results(solution)}
 
     case = contact_case(
         bodies,
         primal,
+        whole.rows,
         form,
         parts=decomposed,
         floating=lambda: elastic.floating,
@@ -91,6 +94,7 @@ def case_of(
         supported=lambda: elastic.supported,
         quantities=results,
         friction=friction,
+        settle=lambda s: least_motion(bodies.rigid, primal, s, friction),
     )
     return case if problem.exact is None else with_exact_tractions(case, problem.exact)
 
@@ -138,8 +142,10 @@ class MonolithicSolution:
 def contact_case(
     bodies: Bodies,
     primal: QP,
+    rows: ContactRows,
     form: str,
     *,
+    settle: Callable[[Solution], Solution] = lambda s: s,
     floating: Factorise,
     clamped: Factorise,
     supported: Factorise,
@@ -151,6 +157,9 @@ def contact_case(
 
     Parameters
     ----------
+    rows : contact rows of `primal`
+    settle : function that selects one of the solutions with equal forces, for all
+        results except certificates
     floating : function that factorises K and returns K⁺ with the rigid modes as kernel;
         called only for the form `dual`
     clamped : function that returns K⁺ with the fixed components eliminated; called only
@@ -188,12 +197,21 @@ def contact_case(
         seconds = inverse.seconds + perf_counter() - start
         matrices = _paper(transformed.qp, primal, friction, form, inverse)
     energy = bodies.force * bodies.length
+
+    def recovered(s: Solution) -> Solution:
+        return settle(transformed.recover(s))
+
     return Case(
         qp=transformed.qp,
-        recover=lambda s: transformed.recover(s).x * bodies.length,
-        quantities=lambda s: {**quantities(transformed.recover(s)), **decomposition},
+        recover=lambda s: recovered(s).x * bodies.length,
+        quantities=lambda s: {**quantities(recovered(s)), **decomposition},
         fields=lambda s: fields(
-            bodies, primal, transformed.recover(s), friction, subdomains=subdomains
+            bodies,
+            primal,
+            recovered(s),
+            rows,
+            friction,
+            subdomains=subdomains,
         ),
         scale=transformed.sign * energy,
         constant=transformed.constant * energy,

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, diags_array, vstack
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array, vstack
 
 from mortarbench.harness import (
     QP,
@@ -22,7 +22,6 @@ from mortarbench.harness import (
     Solution,
     Status,
     Vector,
-    no_rows,
 )
 from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
 from mortarbench.harness.mechanics import boundary_facets
@@ -30,9 +29,11 @@ from mortarbench.problems.contact.bodies import (
     ContactPair,
     ContactSides,
     elasticity_matrices,
+    slave_places,
 )
-from mortarbench.problems.contact.friction import forces_at_nodes, friction_of
+from mortarbench.problems.contact.friction import friction_of
 from mortarbench.problems.contact.results import BulkResults, results_of
+from mortarbench.problems.contact.rows import ContactRows, without_fixed
 from mortarbench.problems.contact.stepping import Forces, LoadPath, Stage, State
 from mortarbench.problems.duality.problem import (
     Choice,
@@ -97,7 +98,7 @@ class DecomposedLinearisation:
         """Return the multipliers λ_n (m,) of the contact rows."""
         dual = self.dual
         z = contact_multipliers(dual.subdomains, dual.halo, s)
-        return z[: self.sides.place.size]
+        return z[: self.sides.c.size]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (w,) on the contact sides and the normal forces (places,).
@@ -108,7 +109,9 @@ class DecomposedLinearisation:
         dual, sides = self.dual, self.sides
         solution = local_solution(dual.subdomains, dual.halo, s)
         vars(self).pop("_qp", None)  # release the large explicit blocks
-        forces = forces_at_nodes(self.normal_multipliers(s), sides.place, sides.places)
+        # negative multipliers of inexact solutions would be negative friction bounds
+        normal = np.maximum(self.normal_multipliers(s), 0.0)
+        forces = sides.rows.at_places(normal, slave_places(sides.bodies.pairs))
         return solution.at(sides.component), forces
 
 
@@ -136,8 +139,8 @@ def decomposed_path(
         return DecomposedLinearisation(stage, previous[0], sides, reference)
 
     zero = np.zeros(elastic.shape.dim * side_nodes(elastic.pairs).size)
-    places = sum(pair.slave_nodes.size for pair in elastic.pairs)
-    rest = State(zero, zero, np.full(places, problem.initial_force))
+    forces = np.full(slave_places(elastic.pairs), problem.initial_force)
+    rest = State(zero, zero, forces)
     return LoadPath(problem.stages, pose, rest)
 
 
@@ -241,10 +244,14 @@ class LinearisedSides:
     bodies: ContactSides  #: contact sides with a total of N nodes
     node: Nodes  #: (N,) global numbers of these nodes
     nodes: int  #: number of nodes of the bodies
-    B: csr_array  #: (m, dim·N) contact rows B u ≤ c in local components
-    c: Vector  #: (m,) right-hand side
+    rows: ContactRows  #: contact rows B u ≤ c in local components, m
+    fixed: Nodes  #: local components that supports prescribe
     friction: Friction  #: friction rows; empty without friction
-    place: Nodes  #: (m,) slave node of each row
+
+    @property
+    def c(self) -> Vector:
+        """Right-hand sides (m,), nondimensional."""
+        return self.rows.c / self.bodies.length
 
     @property
     def component(self) -> Nodes:
@@ -252,14 +259,9 @@ class LinearisedSides:
         return dofs_of(self.node, self.bodies.mesh.dim)
 
     @property
-    def places(self) -> int:
-        """Number of slave nodes."""
-        return sum(pair.slave_nodes.size for pair in self.bodies.pairs)
-
-    @property
     def contact(self) -> Contact:
         """Contact rows followed by friction rows, in global components."""
-        friction, B, c = self.friction, self.B, self.c
+        friction, B, c = self.friction, self.rows.B, self.c
         if friction.bound.size:
             B = csr_array(vstack([B, friction.T]))
             c = np.append(c, friction.start)
@@ -284,14 +286,15 @@ def linearise_sides(
         length=elastic.length,
         force=elastic.force,
     )
+    fixed = np.flatnonzero(np.isin(dofs_of(node, elastic.shape.dim), stage.fixed))
     rows = problem.linearise(bodies, stage.laws)(at.u * elastic.length)
+    rows = without_fixed(rows, fixed)
     return LinearisedSides(
         bodies=bodies,
         node=node,
         nodes=layout.nodes,
-        B=csr_array(rows.B),
-        c=rows.c / elastic.length,
-        place=rows.place,
+        rows=rows,
+        fixed=fixed,
         friction=friction_of(
             bodies, rows, stage.laws, at.slip_origin, at.normal_forces
         ),
@@ -330,9 +333,9 @@ class DistributedSolution:
         primal = QP(
             P=csc_array(diags_array(diagonal)),
             q=np.zeros(w),
-            A=no_rows(w),
-            b=np.zeros(0),
-            G=sides.B,
+            A=csr_array(eye_array(w, format="csr")[sides.fixed]),
+            b=np.zeros(sides.fixed.size),
+            G=sides.rows.B,
             h=sides.c,
             lb=-free,
             ub=free,
@@ -340,11 +343,11 @@ class DistributedSolution:
         s = Solution(
             status=Status.SOLVED,
             x=self.at(component),
-            y=np.zeros(0),
+            y=np.zeros(sides.fixed.size),
             z=self.solution.z,
             z_box=np.zeros(w),
         )
-        return InterfaceState(sides.bodies, primal, s, sides.friction)
+        return InterfaceState(sides.bodies, primal, s, sides.rows, sides.friction)
 
 
 def _quantities(
@@ -363,9 +366,7 @@ def _quantities(
             solution.solution, elastic.length, elastic.materials, elastic.plane
         ),
     )
-    at = solution.sides
-    quantities = results_of(bulk, at.bodies, at.primal, at.solution, at.friction)
-    return {**quantities, **problem.results(solution)}
+    return {**results_of(bulk, *solution.sides), **problem.results(solution)}
 
 
 def longitudinal_share(D: NDArray[np.float64]) -> Vector:

@@ -20,14 +20,11 @@ from mortarbench.problems.contact.balance import check_friction
 from mortarbench.problems.contact.bodies import (
     Bodies,
     factorise_supported,
+    slave_places,
     support_rows,
 )
-from mortarbench.problems.contact.friction import (
-    FrictionLaw,
-    forces_at_nodes,
-    friction_of,
-)
-from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.friction import FrictionLaw, friction_of
+from mortarbench.problems.contact.rows import ContactRows, without_fixed
 from mortarbench.problems.contact.stepping import (
     LoadPath,
     Stage,
@@ -58,7 +55,7 @@ class MonolithicLinearisation:
     bodies: Bodies  #: bodies with the load and the supports of the stage
     primal: QP  #: QP of equation (1) of the paper
     friction: Friction
-    place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
+    rows: ContactRows  #: contact rows of `primal`, m
     #: function that returns the dual with the initial friction bounds, which `solve`
     #: replaces
     dual: Callable[[], Transformed]
@@ -85,7 +82,7 @@ class MonolithicLinearisation:
 
     def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
-        m, k = self.place.size, self.friction.bound.size
+        m, k = self.primal.h.size, self.friction.bound.size
         return s.x[-m - k :][:m]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
@@ -93,8 +90,9 @@ class MonolithicLinearisation:
 
         Only the entries of u on the contact sides are valid.
         """
-        places = sum(pair.slave_nodes.size for pair in self.bodies.pairs)
-        forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
+        # negative multipliers of inexact solutions would be negative friction bounds
+        normal = np.maximum(self.normal_multipliers(s), 0.0)
+        forces = self.rows.at_places(normal, slave_places(self.bodies.pairs))
         return self.dual().interface_displacement(s), forces
 
 
@@ -222,7 +220,7 @@ def _path(
         return bodies_by_stage[names]
 
     def pose(stage: Stage, at: State) -> MonolithicLinearisation:
-        rows = linearise(stage.laws)(at.u * bodies.length)
+        rows = without_fixed(linearise(stage.laws)(at.u * bodies.length), stage.fixed)
         loaded, load = bodies_of(stage), (id(stage.forces), id(stage.fixed))
         primal = primal_qp(loaded, rows, stage.part)
         first = friction_of(loaded, rows, stage.laws, at.slip_origin, at.normal_forces)
@@ -236,11 +234,10 @@ def _path(
             return transform(primal, inverse(stage), free[load] * stage.part, first)
 
         return MonolithicLinearisation(
-            loaded, primal, first, rows.place, dual, reference, stage.part
+            loaded, primal, first, rows, dual, reference, stage.part
         )
 
-    places = sum(pair.slave_nodes.size for pair in bodies.pairs)
-    zero = np.zeros(bodies.mesh.dofs)
+    zero, places = np.zeros(bodies.mesh.dofs), slave_places(bodies.pairs)
     return MonolithicPath(
         stages, pose, State(zero, zero, np.full(places, initial_force))
     )

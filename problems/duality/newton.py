@@ -70,8 +70,12 @@ from mortarbench.harness import (
 )
 from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.verify.kkt import kkt_residuals
-from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
-from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    factorise_clamped,
+    slave_places,
+)
+from mortarbench.problems.contact.rows import ContactRows, without_fixed
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import MAX_REFERENCE_RESIDUAL, primal_qp
@@ -113,8 +117,8 @@ ARMIJO_FRACTION = 1e-4  #: required fraction of the decrease predicted by the sl
 PENALTY_FACTOR = 1.5
 MAX_ROTATION = 1e-8  #: largest rotational fraction of a motion that counts as rounding
 
-#: function that maps a displacement (n,) in m and multipliers (m,) in N/m to blocks
-#: −λ_i g_i''(u), (m, k, k) in Pa, and their displacement components (m, k)
+#: function that maps a displacement (n,) in m and multipliers (places,) in N/m to
+#: blocks −λ_i g_i''(u), (places, k, k) in Pa, and their displacement components
 Curvature = Callable[[Vector, Vector], tuple[NDArray[np.float64], NDArray[np.int64]]]
 
 
@@ -294,13 +298,11 @@ class NewtonPath:
 
     @property
     def _places(self) -> int:
-        return sum(pair.slave_nodes.size for pair in self.bodies.pairs)
+        return slave_places(self.bodies.pairs)
 
     def _at_places(self, at: Iteration) -> Vector:
         """Return multipliers (places,) of slave nodes; zero for nodes without a row."""
-        force = np.zeros(self._places)
-        force[at.rows.place] = np.maximum(at.answer.z, 0.0)
-        return force
+        return at.rows.at_places(np.maximum(at.answer.z, 0.0), self._places)
 
     def _solve_load(
         self, load_factor: float, u: Vector, lam: Vector
@@ -361,6 +363,7 @@ class NewtonPath:
         self, u: Vector, load_factor: float, gaps: Gaps
     ) -> Configuration:
         rows = gaps.linearise(u * self.bodies.length)
+        rows = without_fixed(rows, self.bodies.B_D.indices)
         gap = rows.c / self.bodies.length - rows.B @ u
         cells, f = evaluate(self.cells, u), load_factor * self.bodies.f
         return Configuration(
@@ -377,7 +380,7 @@ class NewtonPath:
 
         lam : (places,) multipliers λ of the slave nodes
         """
-        pressing = lam[at.rows.place]
+        pressing = at.rows.of_rows(lam[at.rows.place])
         contact = at.rows.B.T @ pressing
         imbalance = self._free_norm(at.r + contact) / self._forces(at, lam, load_factor)
         largest = pressing.max(initial=0.0) or 1.0
@@ -387,7 +390,7 @@ class NewtonPath:
 
     def _forces(self, at: Configuration, lam: Vector, load_factor: float) -> float:
         """Return the larger of the norms of the load and of Bᵀλ; 1 if both are zero."""
-        contact = at.rows.B.T @ lam[at.rows.place]
+        contact = at.rows.B.T @ at.rows.of_rows(lam[at.rows.place])
         load = self._free_norm(load_factor * self.bodies.f)
         return max(load, self._free_norm(contact)) or 1.0
 
@@ -476,7 +479,7 @@ class NewtonPath:
         if curvature is None:
             return csc_array((n, n))
         l, F = self.bodies.length, self.bodies.force
-        blocks, dofs = curvature(at.u * l, lam[at.rows.place] * F)
+        blocks, dofs = curvature(at.u * l, lam * F)
         if convex:
             blocks, _ = clip_eigenvalues(blocks)
         i, j = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, (1, dofs.shape[1]))

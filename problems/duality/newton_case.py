@@ -126,12 +126,13 @@ def newton_case(
 
     def collected(s: Solution) -> Mapping[str, Any]:
         stresses = cauchy_stresses(path.cells, bodies, s.x)
-        values = quantities(bodies, primal, s, stresses=stresses)
+        values = quantities(bodies, primal, s, at.rows, stresses=stresses)
         return values | path_state(path, at, s) | step_quantities | dict(results(at, s))
 
     case = contact_case(
         bodies,
         primal,
+        at.rows,
         form,
         floating=lambda: sliding_inverse(bodies),
         clamped=lambda: factorise_clamped(bodies),
@@ -144,7 +145,7 @@ def newton_case(
     def deformed_fields(s: Solution) -> Fields:
         s = to_primal(s)
         stresses = cauchy_stresses(path.cells, bodies, s.x)
-        return fields(bodies, primal, s, stresses=stresses)
+        return fields(bodies, primal, s, at.rows, stresses=stresses)
 
     return replace(
         case,

@@ -29,7 +29,7 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.contact.stepping import Forces, Stage, forces_of
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.inverse import GeneralisedInverse
@@ -309,6 +309,7 @@ class InterfaceState(NamedTuple):
     #: friction
     primal: QP
     solution: Solution
+    rows: ContactRows  #: contact rows of `primal`
     friction: Friction
 
 

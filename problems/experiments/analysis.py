@@ -16,8 +16,8 @@ from functools import partial
 from mortarbench.harness import QP, Fields, Reference, Solution, Status, Vector
 from mortarbench.problems.contact.bodies import Bodies, factorise_floating
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.results import fields
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.experiments.clock import Laps, Stopwatch, race
@@ -39,6 +39,7 @@ class Analysis:
 
     bodies: Bodies
     primal: QP  #: primal QP of the last step
+    rows: ContactRows  #: contact rows of `primal`
     solution: Solution  #: solution of the last step
     dual: QP  #: dual QP of the last step
     laps: Laps  #: mapping from each part to its time in s, summed over all steps
@@ -86,10 +87,9 @@ def analyse(
     laps = dict(watch.laps)
 
     qp, solution = solutions[-1]
-    primal = path.primal(steps)
-    return Analysis(
-        bodies, primal, dualise(primal, inverse).recover(solution), qp, laps
-    )
+    last = path.problem(steps).problem
+    answer = dualise(last.primal, inverse).recover(solution)
+    return Analysis(bodies, last.primal, last.rows, answer, qp, laps)
 
 
 def scaling(plan: Plan, solve: Reference, baseline: Reference) -> Rows:
@@ -134,5 +134,6 @@ def states(plan: Plan, solve: Reference) -> dict[str, Fields]:
         for name, (Nr, Nh, r) in problems.items()
     }
     return {
-        name: fields(a.bodies, a.primal, a.solution) for name, a in analyses.items()
+        name: fields(a.bodies, a.primal, a.solution, a.rows)
+        for name, a in analyses.items()
     }

@@ -49,8 +49,8 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
 
 
 def _results(bodies: Bodies, path: MonolithicPath, step: int) -> dict[str, Value]:
-    primal, s = path.primal(step), path.answer(step)
-    values = quantities(bodies, primal, s)
+    s, linearised = path.answer(step), path.problem(step).problem
+    values = quantities(bodies, linearised.primal, s, linearised.rows)
     sides = bodies.mesh.boundaries
     tip = s.x[dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)] * LENGTH
     force = values["contact_force"]

@@ -133,7 +133,7 @@ class GmshBodies(ContactFamily):
         from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
         from mortarbench.problems.models.description import remarks
-        from mortarbench.problems.models.gmsh_bodies import overlap_remark
+        from mortarbench.problems.models.gmsh_bodies import contact_remarks
 
         path = str(params["path"])
         try:
@@ -144,4 +144,4 @@ class GmshBodies(ContactFamily):
                 "expected smaller ratios between the sides of cells and between the "
                 "moduli E"
             ) from None
-        return replace(case, remarks=(*remarks(Path(path)), *overlap_remark(params)))
+        return replace(case, remarks=(*remarks(Path(path)), *contact_remarks(params)))

@@ -35,7 +35,7 @@ from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from mortarbench.harness import Case, Reference, Solution, Value, no_rows
 from mortarbench.problems.contact.bodies import Bodies, assemble
-from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.fem.elasticity import Material
@@ -150,10 +150,8 @@ def _path(
 ) -> NewtonPath:
     bodies = beam(slenderness, load, cells, nu)
     n = bodies.mesh.dofs
-    places = np.zeros(0, dtype=np.int64)
-    nothing = ContactRows(
-        no_rows(n), np.zeros(0), no_rows(n), places, np.zeros(0), places
-    )
+    none, place = np.zeros(0), np.zeros(0, dtype=np.int64)
+    nothing = ContactRows(no_rows(n), none, no_rows(n), place, none, place, none, place)
     return newton_path(
         bodies, lambda u: nothing, {"material": material}, reference, steps
     )

@@ -32,6 +32,8 @@
     master = "bottom"
     friction = "coulomb"       # or "tresca" with a bound in Pa; law of this pair
     mu = 0.3
+    reach = 0.1                # m, largest distance from the master at which a slave
+                               # node has a contact row; optional, see below
 
     [[contacts]]
     slave = "foot"             # side against a rigid body, whose lengths are in m:
@@ -44,9 +46,13 @@ This file and all results are in SI units, irrespective of the length unit of th
 E and tractions in Pa, forces in N/m, units.length and rigid bodies in m.
 
 Rigid bodies do not move. The normal of a plane points towards the slave; normals and
-axes may have any length. The centre of a cylinder is any point on its axis. Nodes with
-all components fixed have no contact row. Contact with a rigid body has nodal rows even
-if ``contact = "mortar"``.
+axes may have any length. The centre of a cylinder is any point on its axis. Contact
+with a rigid body has nodal rows even if ``contact = "mortar"``.
+
+The default of reach is the larger extent of the two sides, or no limit for a rigid
+body. Slave nodes beyond the border of the master by more than half a facet have no
+contact row, nor do nodes whose row has no free component because of supports. Each pair
+needs a node with a row.
 
 In .inp files, bodies are element sets, boundaries are surfaces, element sets of facets
 or node sets, and points are node sets. In .med files, bodies are groups of cells,
@@ -222,7 +228,7 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
         loads = _each(table, "loads", lambda entry: _load(entry, named))
         held = np.unique(np.concatenate(fixed))
         _check_loads_act(table["loads"], loads, held)
-        pairs = _each(table, "contacts", lambda entry: _pair(entry, named, held))
+        pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
         _check_unique(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
         length, force = _units(table.get("units", {}), named, load)
@@ -414,13 +420,9 @@ def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
     return law_of(keys)
 
 
-def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
-    """Return the contact pair that an entry describes.
-
-    held : prescribed components; slave nodes at which all components are prescribed are
-        marked as clamped if the master is a rigid body
-    """
-    checked.only_keys(entry, (*_SIDES, "rigid", "friction", *LAW_PARAMETERS))
+def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
+    """Return the contact pair that an entry describes."""
+    checked.only_keys(entry, (*_SIDES, "rigid", "reach", "friction", *LAW_PARAMETERS))
     if ("master" in entry) == ("rigid" in entry):
         raise InputError(f"expected either master (a {named.words.boundary}) or rigid")
     names = [side for side in _SIDES if side in entry]
@@ -430,19 +432,19 @@ def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
         name = _one_of(named.curves, named.words.boundary, entry, side)
         facets = named.curves[name]
         sides[side] = _chain(f"{side} {name!r}", facets) if named.dim == 2 else facets
-    slave = sides["slave"]
+    slave, reach = sides["slave"], None
+    if "reach" in entry:
+        reach = physical("reach", checked.positive("reach", entry["reach"]))
     if "rigid" in entry:
         with located("rigid"):
             rigid = _rigid(checked.table("rigid", entry["rigid"]), named.dim)
             _check_faces(named.points, slave, entry["slave"], rigid)
-        components = dofs_of(np.unique(slave), named.dim).reshape(-1, named.dim)
-        clamped = np.unique(slave)[np.isin(components, held).all(axis=1)]
-        return ContactPair(slave, slave[:0], rigid, clamped)
+        return ContactPair(slave, slave[:0], rigid, reach)
     if np.intersect1d(slave, sides["master"]).size:
         raise InputError(
             "slave and master share nodes; expected sides without common nodes"
         )
-    return ContactPair(slave, sides["master"])
+    return ContactPair(slave, sides["master"], reach=reach)
 
 
 def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:

@@ -19,6 +19,8 @@ from mortarbench.harness.checked import located
 from mortarbench.problems.contact.balance import check_balance, is_determined
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.rows import without_fixed
+from mortarbench.problems.contact.sides import pair_names
 from mortarbench.problems.contact.stepping import load_steps, with_normal_forces
 from mortarbench.problems.duality.newton import NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
@@ -144,28 +146,39 @@ def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None
         check_plane_only("bodies", params, "volumes")
 
 
-def overlap_remark(params: Mapping[str, Value]) -> tuple[str, ...]:
-    """Return a remark if a slave node is inside its master before any load acts.
+def contact_remarks(params: Mapping[str, Value]) -> tuple[str, ...]:
+    """Return remarks on the contact rows of the undeformed bodies.
 
-    Overlaps of up to `MAX_OVERLAP` times the extent of the smallest body are accepted
-    without a remark.
+    Remarks concern slave nodes inside their master before any load acts, except for
+    overlaps of up to `MAX_OVERLAP` times the extent of the smallest body, and rows that
+    are dropped because they have no free component.
     """
     p: Any = params
     whole = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]).whole
-    mesh = whole.mesh
+    mesh, found = whole.mesh, []
     rows = keyed_linearisation(p)(whole, laws_of(p))(np.zeros(mesh.dofs))
     depth = -float(rows.c.min(initial=0.0))
     size = min(
         float(np.ptp(mesh.points[mesh.cells[whole.body == b].ravel()], axis=0).max())
         for b in range(len(whole.names))
     )
-    if depth <= MAX_OVERLAP * size:
-        return ()
-    return (
-        f"{p['path']}: before any load acts, a slave node lies {depth:.3g} m inside "
-        "its master (or behind the plane of its edge): check length_unit and the "
-        "positions of the bodies, unless a press fit is meant",
-    )
+    if depth > MAX_OVERLAP * size:
+        found.append(
+            f"{p['path']}: before any load acts, a slave node lies {depth:.3g} m "
+            "inside its master (or behind the plane of its edge): check length_unit "
+            "and the positions of the bodies, unless a press fit is meant"
+        )
+    kept = without_fixed(rows, whole.B_D.indices).place
+    first = np.cumsum([0, *(pair.slave_nodes.size for pair in whole.pairs)])
+    before, after = (np.histogram(place, first)[0] for place in (rows.place, kept))
+    found += [
+        f"{p['path']}: contact {name}: {a - b} of {a} contact rows were dropped, "
+        "because supports fix all components of these rows, and therefore carry any "
+        "force there"
+        for name, a, b in zip(pair_names(whole), before, after, strict=True)
+        if b < a
+    ]
+    return tuple(found)
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:

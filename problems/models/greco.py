@@ -31,6 +31,7 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.rigid import RigidPlane
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
@@ -132,8 +133,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         ]
     )
     rigid = RigidPlane((0.0,) * dim, (0.0, 1.0, 0.0)[:dim])
-    clamped = np.intersect1d(body.ground, body.corner)
-    on_rigid = ContactPair(body.ground, body.ground[:0], rigid, clamped)
+    on_rigid = ContactPair(body.ground, body.ground[:0], rigid)
     return ContactProblem(
         bodies=ElasticBodies(
             shape=body.shape,
@@ -159,6 +159,7 @@ def published_quantities(
     bodies: Bodies | ContactSides,
     primal: QP,
     s: Solution,
+    rows: ContactRows,
     friction: Friction,
     thickness: float,
 ) -> dict[str, Any]:
@@ -171,7 +172,7 @@ def published_quantities(
     force in N/m.
     """
     dim, (pair,) = bodies.mesh.dim, bodies.pairs
-    nodes = np.setdiff1d(pair.slave_nodes, pair.clamped)  # nodes with contact rows
+    nodes = pair.slave_nodes[rows.place]  # nodes with contact rows
     x, column = np.unique(bodies.mesh.points[nodes, 0], return_inverse=True)
     u = s.x[dofs_of(nodes, dim, 0)] * bodies.length
     normal = np.bincount(column, s.z[: primal.h.size]) * bodies.force / thickness

@@ -101,7 +101,7 @@ def plane_problem(params: Mapping[str, Value]) -> ContactProblem:
     elastic, exact = _cylinder_on_plane(params)
 
     def results(answer: ContactSolution) -> dict[str, Any]:
-        bodies, primal, s, _ = answer.sides
+        bodies, primal, s, _, _ = answer.sides
         return pressure_quantities(bodies, primal, exact, s)
 
     return ContactProblem(
@@ -185,7 +185,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         return lambda u: rows(np.zeros_like(u))
 
     def results(answer: ContactSolution) -> dict[str, Any]:
-        bodies, primal, s, friction = answer.sides
+        bodies, primal, s, _, friction = answer.sides
         values = pressure_quantities(bodies, primal, exact, s)
         if shear is not None:
             values |= shear_quantities(bodies, primal, exact, s, friction, p, shear)

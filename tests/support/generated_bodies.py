@@ -152,9 +152,9 @@ def _case(
     rows = linearisation(bodies, *method)(np.zeros(mesh.dofs))
     primal = primal_qp(bodies, rows)
     return contact_case(
-        bodies, primal, "dual",
+        bodies, primal, rows, "dual",
         floating=lambda: factorise_floating(bodies),
         clamped=lambda: factorise_clamped(bodies),
         supported=lambda: factorise_supported(bodies),
-        quantities=lambda s: quantities(bodies, primal, s),
+        quantities=lambda s: quantities(bodies, primal, s, rows),
     )  # fmt: skip

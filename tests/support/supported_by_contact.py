@@ -63,11 +63,11 @@ def disc_between_plates(
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
     return contact_case(
-        bodies, primal, form,
+        bodies, primal, rows, form,
         floating=lambda: factorise_floating(bodies),
         clamped=lambda: factorise_clamped(bodies),
         supported=lambda: factorise_supported(bodies),
-        quantities=lambda s: quantities(bodies, primal, s),
+        quantities=lambda s: quantities(bodies, primal, s, rows),
     )  # fmt: skip
 
 

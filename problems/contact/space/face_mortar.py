@@ -48,9 +48,13 @@ from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.mortar import Basis
-from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.rows import ContactRows, without_outer
 from mortarbench.problems.contact.segment_search import Reach
-from mortarbench.problems.contact.space.triangles import FaceTriangles, triangulated
+from mortarbench.problems.contact.space.triangles import (
+    FaceTriangles,
+    closest_points,
+    triangulated,
+)
 from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
@@ -103,6 +107,7 @@ def face_mortar(
     basis: Basis = "dual",
     reach: Reach = Reach(),  # noqa: B008 - frozen
     tangential: bool = False,
+    part: NDArray[np.bool_] | None = None,
 ) -> ContactRows:
     """Linearise the weak non-penetration condition at u, with a row per covered node.
 
@@ -111,7 +116,7 @@ def face_mortar(
     points : (N, 3) reference positions X, m
     u : (3N,) displacement u^k at which to linearise, m
     slave, master : (f, 4), (g, 4) faces of both sides, boundaries of a `Mesh`
-    basis, reach, tangential : see `problems.contact.mortar.mortar`
+    basis, reach, tangential, part : see `problems.contact.mortar.mortar`
 
     Returns
     -------
@@ -128,8 +133,10 @@ def face_mortar(
         for side, name in ((slave, "slave"), (master, "master"))
     )
     nodes = np.unique(slave), np.unique(master)
-    at = overlaps(triangulated(s), triangulated(m), reach)
+    own, other = triangulated(s), triangulated(m)
+    at = overlaps(own if part is None else triangulated(s.part(part)), other, reach)
     A = _dual(at) if basis == "dual" else np.eye(4)  # Φ = A N
+    at = at if part is None else at._replace(slave=np.flatnonzero(part)[at.slave])
     j, k = s.facets[at.slave], m.facets[at.master]
     cover = _gather(at.area, j, len(s.x))
     gap = _gather((A @ at.gap[..., None])[..., 0], j, len(s.x))
@@ -140,8 +147,8 @@ def face_mortar(
     def rows(direction: Points) -> csr_array:
         """Return rows along directions (p, 4, 3) of the slave nodes of each overlap."""
         entries = [
-            _entries(values, direction, j, own[columns])
-            for values, columns, own in ((D, j, nodes[0]), (-M, k, nodes[1]))
+            _entries(values, direction, j, numbers[columns])
+            for values, columns, numbers in ((D, j, nodes[0]), (-M, k, nodes[1]))
         ]
         value, row, column = map(np.concatenate, zip(*entries, strict=True))
         shape = (len(s.x), points.size)
@@ -158,9 +165,26 @@ def face_mortar(
         # both tangents of a row in succession
         order = np.arange(2 * active.size).reshape(2, -1).T.ravel()
         T = csr_array(vstack(stacked).tocsr()[order])
-    return ContactRows(
-        B, gap[active] / cover[active] + B @ u, T, row, cover[active], active
+    covered = ContactRows(
+        B,
+        gap[active] / cover[active] + B @ u,
+        T,
+        row,
+        cover[active],
+        active,
+        (cover / _integrals_of(own))[active],
+        np.arange(active.size),
     )
+    return without_outer(covered, s, closest_points(s.x, other).beyond)
+
+
+def _integrals_of(side: FaceTriangles) -> Vector:
+    """Return ∫N_j (v,) over the faces, projected onto their auxiliary planes."""
+    a, b = (side.vertices[:, k] - side.vertices[:, 0] for k in (1, 2))
+    area = np.einsum("tx,tx->t", np.cross(a, b), side.surface.normal[side.face]) / 2
+    integrals = area[:, None] * side.shape.mean(axis=1)
+    nodes = side.surface.facets[side.face]
+    return _gather(integrals, nodes, len(side.surface.x))
 
 
 def overlaps(slave: FaceTriangles, master: FaceTriangles, reach: Reach) -> Overlaps:

@@ -7,35 +7,31 @@ B = [−n at s, +N_a n at a] and c = g + B u^k.
 
 The closest point is determined on the triangles of the faces
 (`problems.contact.space.triangles`). The normal n is that of the face; at an edge or a
-corner where several faces meet, their normals are averaged.
+corner where several faces meet, their normals are averaged. For
+slave nodes beyond the border of the master, see `problems.contact.rows`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.node_to_segment import ContactRows, rows_along
-from mortarbench.problems.contact.space.triangles import FaceTriangles, triangulated
-from mortarbench.problems.contact.surface import Points, current_surface, tangents
+from mortarbench.problems.contact.rows import (
+    ContactRows,
+    Feet,
+    SlaveNodes,
+    nodal_rows,
+)
+from mortarbench.problems.contact.space.face_mortar import face_mortar
+from mortarbench.problems.contact.space.triangles import (
+    closest_points,
+    projected_on_planes,
+    triangulated,
+)
+from mortarbench.problems.contact.surface import Points, current_surface
 from mortarbench.problems.fem.mesh import Nodes
-
-#: the closest points on two faces are the same point of a common edge if their
-#: distance, relative to the radius of a face, is below this value
-SAME_POINT = 1e-9
-
-
-class ClosestPoints(NamedTuple):
-    """Closest points of s positions on faces."""
-
-    face: Nodes  #: (s,) face that contains the closest point
-    N: NDArray[np.float64]  #: (s, 4) shape functions of the face at the closest point
-    normal: Points  #: (s, 3) outward unit normal of the master at the closest point
 
 
 def node_to_face(
@@ -57,7 +53,8 @@ def node_to_face(
 
     Returns
     -------
-    one contact row per slave node, in ascending order of their numbers
+    one contact row per slave node, in ascending order of their numbers, except for
+    nodes beyond the border of the master
 
     Raises
     ------
@@ -70,73 +67,30 @@ def node_to_face(
         current_surface(points, u, faces, name)
         for faces, name in ((slave, "slave"), (master, "master"))
     )
-    x, closest = side.x, closest_points(side.x, triangulated(other))
-    at = other.facets[closest.face]
-    gap = np.einsum("sx,sx->s", x, closest.normal)
-    gap -= np.einsum("sa,sax,sx->s", closest.N, other.x[at], closest.normal)
-    node = np.column_stack([own, nodes[at]])
-    weight = np.column_stack([-np.ones(own.size), closest.N])
-    B = rows_along(node, weight, closest.normal, points.size)
-    T, row = csr_array((0, points.size)), np.arange(0)
-    if tangential:
-        row = np.repeat(np.arange(own.size), 2)
-        along = tangents(closest.normal).reshape(-1, 3)
-        T = rows_along(node[row], weight[row], along, points.size)
-    return ContactRows(B, gap + B @ u, T, row, side.areas, np.arange(own.size))
-
-
-def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
-    """Return the closest points of x (s, 3) on faces, with outward normals."""
-    tree = KDTree(faces.centre)
-    # `nearest` is the distance to the closest centre of a face. Faces contain their
-    # centres, so the distance to the closest point is at most `nearest`. The distance
-    # to the centre of the face that contains this point is larger by at most the radius
-    # of the face
-    nearest, _ = tree.query(x)
-    found = tree.query_ball_point(x, nearest * (1 + SAME_POINT) + faces.radius.max())
-    candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
-    t, pair = faces.of_faces(candidate)
-    node = np.repeat(np.arange(len(x)), [len(k) for k in found])[pair]
-    barycentric = closest_in_triangles(x[node], faces.vertices[t])
-    at = np.einsum("pv,pvx->px", barycentric, faces.vertices[t])
-    distance = np.linalg.norm(at - x[node], axis=1)
-    order = np.lexsort([distance, node])
-    best = order[np.unique(node[order], return_index=True)[1]]
-    # average the normals of all faces that meet at the closest point
-    same = np.linalg.norm(at - at[best][node], axis=1)
-    meets = same <= SAME_POINT * faces.radius[faces.face[t]]
-    touching = np.unique(np.stack([node, faces.face[t]])[:, meets], axis=1)
-    total = np.zeros_like(x)
-    np.add.at(total, touching[0], faces.surface.normal[touching[1]])
-    size = np.linalg.norm(total, axis=1, keepdims=True)
-    face = faces.face[t[best]]
-    normal = np.where(
-        size > 0, total / np.where(size > 0, size, 1), faces.surface.normal[face]
+    faces = triangulated(other)
+    closest = closest_points(side.x, faces)
+    at, N, normal = other.facets[closest.face], closest.N, closest.normal
+    outside = np.flatnonzero(closest.beyond)
+    if outside.size:  # opposite the extended plane of the nearest triangle
+        t = closest.triangle[outside]
+        weight = projected_on_planes(side.x[outside], faces.vertices[t])
+        N[outside] = np.einsum("sv,svc->sc", weight, faces.shape[t])
+        normal[outside] = faces.normals[t]
+    foot = np.einsum("sa,sax->sx", N, other.x[at])
+    radius = faces.radius[closest.face]
+    return nodal_rows(
+        u,
+        SlaveNodes(own, side.x, side.areas),
+        Feet(nodes[at], N, foot, normal, closest.beyond, radius),
+        lambda: side,
+        partial(
+            face_mortar,
+            points,
+            u,
+            slave,
+            master,
+            basis="standard",
+            tangential=tangential,
+        ),
+        tangential=tangential,
     )
-    N = np.einsum("sv,svc->sc", barycentric[best], faces.shape[t[best]])
-    return ClosestPoints(face, N, normal)
-
-
-def closest_in_triangles(x: Points, triangle: Points) -> NDArray[np.float64]:
-    """Return barycentric coordinates (p, 3) of the closest points of x (p, 3).
-
-    The closest point is the foot of the perpendicular if the foot is inside the
-    triangle, and otherwise the closest point of the nearest edge.
-
-    triangle : (p, 3, 3) vertices
-    """
-    edges = np.roll(triangle, -1, axis=1) - triangle  # edge k from vertex k to k + 1
-    offset = x[:, None] - triangle
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    square = np.einsum("px,px->p", normal, normal)[:, None]
-    # the barycentric coordinate of vertex k + 2 is the area over edge k
-    parts = np.einsum("pkx,px->pk", np.cross(edges, offset), normal) / square
-    foot = np.roll(parts, 2, axis=1)
-    length = np.einsum("pkx,pkx->pk", edges, edges)
-    along = np.clip(np.einsum("pkx,pkx->pk", offset, edges) / length, 0.0, 1.0)
-    away = offset - along[..., None] * edges
-    k = np.einsum("pkx,pkx->pk", away, away).argmin(axis=1)
-    p = np.arange(len(x))
-    on_edge = np.zeros((len(x), 3))
-    on_edge[p, k], on_edge[p, (k + 1) % 3] = 1 - along[p, k], along[p, k]
-    return np.where((foot >= 0).all(axis=1)[:, None], foot, on_edge)

@@ -405,7 +405,7 @@ def _quantities(
 
     copies : number of blocks that form a sphere, by symmetry
     """
-    bodies, primal, s, _ = solution.sides
+    bodies, primal, s, _, _ = solution.sides
     (side,) = contact_sides(*solution.sides)
     points, force = bodies.mesh.points[side.nodes], copies * side.force
     normal = force[:, 2]

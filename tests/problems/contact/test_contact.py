@@ -6,6 +6,7 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.problems.contact import node_to_segment as contact
 from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.rows import rows_along
 from mortarbench.problems.contact.surface import surface
 
 #: master below the slave; its chain runs from right to left, so that the body is below
@@ -219,7 +220,7 @@ def test_rows_along_directions_in_space_weight_displacements_of_nodes():
     direction = np.array([[0.0, 0, 1], [0.6, 0.8, 0]])
     u = np.arange(12) ** 2.0
 
-    B = contact.rows_along(node, weight, direction, 12)
+    B = rows_along(node, weight, direction, 12)
 
     v = u.reshape(-1, 3)
     expected = [v[2, 2] - v[0, 2], direction[1] @ (0.5 * v[3] - v[1])]

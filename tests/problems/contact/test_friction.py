@@ -14,11 +14,11 @@ from mortarbench.problems.contact.bodies import ContactPair
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
     coulomb_fixed_point,
-    forces_at_nodes,
     friction_of,
     law_of,
     select_iterate,
 )
+from mortarbench.problems.contact.rows import ContactRows
 
 FORCE = 6.0  #: normal force without friction
 
@@ -120,12 +120,6 @@ def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
         select_iterate(problems, 4, 5)
 
 
-def test_contact_forces_on_nodes_are_compressive():
-    force = forces_at_nodes(np.array([2.0, -1.0, 3.0]), np.array([4, 0, 1]), 5)
-
-    assert force.tolist() == [0, 3, 0, 0, 2]
-
-
 def test_a_law_reads_only_its_own_parameter():
     keys = {"bound": 5.0, "mu": 0.3}
 
@@ -141,9 +135,10 @@ def test_each_row_has_the_law_of_its_pair_the_share_of_its_side_and_its_nodes_fo
     """Two pairs have two and three slave nodes; nodes 1, 2 and 4 have contact rows."""
     pairs = [ContactPair(np.arange(k), np.arange(0)) for k in (2, 3)]
     bodies = SimpleNamespace(pairs=pairs, force=10.0)
-    rows = SimpleNamespace(
-        row=np.array([0, 1, 2]), place=np.array([1, 2, 4]),
-        share=np.array([0.5, 2.0, 4.0]), T=csr_array(np.eye(3)),
+    every, eye = np.arange(3), csr_array(np.eye(3))
+    rows = ContactRows(
+        B=eye, c=np.zeros(3), T=eye, row=every, share=np.array([0.5, 2.0, 4.0]),
+        place=np.array([1, 2, 4]), covered=np.ones(3), at=every,
     )  # fmt: skip
     laws = FrictionLaw("tresca", bound=20.0), FrictionLaw("coulomb", mu=0.5)
     before, pressed = np.array([7.0, 8.0, 9.0]), np.array([1.0, 1.0, 3.0, 1.0, 5.0])

@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mortarbench.problems.contact.node_to_segment import node_to_segment
-from mortarbench.problems.contact.space.node_to_face import (
+from mortarbench.problems.contact.space.node_to_face import node_to_face
+from mortarbench.problems.contact.space.triangles import (
     closest_in_triangles,
     closest_points,
-    node_to_face,
+    triangulated,
 )
-from mortarbench.problems.contact.space.triangles import triangulated
 from mortarbench.problems.contact.surface import faceted_surface
 
 

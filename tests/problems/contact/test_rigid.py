@@ -11,8 +11,9 @@ from mortarbench.problems.contact.rigid import (
     RigidSphere,
     rigid_rows,
 )
+from mortarbench.problems.contact.rows import without_fixed
 from mortarbench.problems.contact.surface import current_surface, tangents
-from mortarbench.problems.fem.mesh import box, nodal_lengths, rectangle
+from mortarbench.problems.fem.mesh import box, dofs_of, nodal_lengths, rectangle
 from tests.support.hexahedra import TETRAHEDRA, divided
 
 SLANTED = tuple(Rotation.from_rotvec([0.4, -1.1, 0.7]).apply([0, 0, 1]))
@@ -76,16 +77,15 @@ def test_rows_are_the_gap_to_first_order(name):
 
 
 def test_a_node_that_is_clamped_has_no_row():
-    side = BLOCK.boundaries["bottom"]
-    nodes = np.unique(side)
-    u = np.zeros(BLOCK.dofs)
+    side, u = BLOCK.boundaries["bottom"], np.zeros(BLOCK.dofs)
     clamped = np.flatnonzero(BLOCK.points[:, 0] == 0)
-    rows = rigid_rows(BLOCK.points, u, side, BODIES["plane"], clamped=clamped)
-    every = rigid_rows(BLOCK.points, u, side, BODIES["plane"])
+    every = rigid_rows(BLOCK.points, u, side, BODIES["plane"], tangential=True)
+    rows = without_fixed(every, dofs_of(clamped, 3))
 
-    assert BLOCK.points[nodes[rows.place], 0].min() == 0.5
+    assert BLOCK.points[np.unique(side)[rows.place], 0].min() == 0.5
     assert (rows.B != every.B[rows.place]).nnz == 0
     assert rows.share == pytest.approx(every.share[rows.place])
+    assert rows.row.tolist() == np.repeat(np.arange(rows.c.size), 2).tolist()
 
 
 def test_tangents_in_space_are_orthonormal_and_right_handed():

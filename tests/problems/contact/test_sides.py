@@ -6,7 +6,7 @@ import pytest
 from mortarbench.harness import Solution, Status
 from mortarbench.problems.contact.bodies import ContactPair
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.sides import contact_sides, rows_of_pairs
+from mortarbench.problems.contact.sides import contact_sides
 from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.families.hertz import HertzPlane
 from mortarbench.problems.families.patch import ContactPatch
@@ -39,9 +39,9 @@ def test_each_pair_of_a_disc_between_plates_carries_the_load(
     contact, basis, disc_is_slave
 ):
     case = disc_between_plates(
-        8, contact=contact, basis=basis, disc_is_slave=disc_is_slave
+        8, form="dual", contact=contact, basis=basis, disc_is_slave=disc_is_slave
     )
-    s = Clarabel().prepare(case.qp, 1e-10)()
+    s = reference_solution(case.qp)
     contacts, sides = case.quantities(s)["contacts"], case.fields(s).contacts
     on = ("disc on {}", "{} on disc")[not disc_is_slave]
     total = 3 * PRESS
@@ -98,7 +98,7 @@ def test_a_node_without_a_row_has_no_gap_and_no_pressure():
         status=Status.SOLVED, x=np.zeros(bodies.mesh.dofs), y=0 * primal.b,
         z=np.ones(primal.h.size), z_box=np.zeros(bodies.mesh.dofs),
     )  # fmt: skip
-    (side,) = contact_sides(bodies, primal, s)
+    (side,) = contact_sides(bodies, primal, s, rows)
     x = bodies.mesh.points[side.nodes, 0]
 
     beside = x > 1.2  # the lower block ends at 1 m
@@ -109,7 +109,8 @@ def test_a_node_without_a_row_has_no_gap_and_no_pressure():
     assert side.pressure[x < 0.9].min() > 0
 
 
-def test_rows_of_pairs_with_a_common_slave_side_are_distinguished():
+def test_pairs_with_a_common_slave_side_have_their_own_rows():
+    """Where the two masters meet, both pairs have the same row in nodal contact."""
     bodies = model({**ContactPatch().defaults, "lower": 6, "upper": 4})
     (pair,) = bodies.pairs
     left, right = pair.master[:3], pair.master[2:]
@@ -119,15 +120,19 @@ def test_rows_of_pairs_with_a_common_slave_side_are_distinguished():
     )  # fmt: skip
     for contact, basis in METHODS:
         rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
-        one, two = rows_of_pairs(rows.B, bodies)
-        n = rows.B.shape[0]
+        second = rows.place >= pair.slave.size
 
-        assert (one.start, one.stop, two.stop) == (0, two.start, n)
-        if contact == "nts":
-            assert one.stop == len(pair.slave)
-        for part, master in ((one, left), (two, right)):
+        assert rows.covered == pytest.approx(
+            rows.share
+            / nodal_lengths(bodies.mesh.points[pair.slave])[
+                rows.place % pair.slave.size
+            ]
+        )
+        assert rows.share.sum() == pytest.approx(1.0)  # the width of the blocks
+        for of_pair, master in ((~second, left), (second, right)):
             side_nodes = np.concatenate([pair.slave, master])
-            assert set(rows.B[part].indices // 2) <= set(side_nodes.tolist())
+            part = rows.B[rows.at[of_pair]]
+            assert set(part.indices // 2) <= set(side_nodes.tolist())
 
 
 def test_lengths_are_those_of_the_undeformed_side():

@@ -12,6 +12,7 @@ from mortarbench.problems.contact.node_to_segment import (
     geometric_stiffness,
     node_to_segment,
 )
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality import newton
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.problems.families.hertz import HertzPlane
@@ -502,7 +503,8 @@ def test_rounding_is_bounded_by_that_of_forces_within_cells(equilibrium):
     K = np.array([[2.0, -2.0], [-2.0, 2.0]])
     bodies = small_bodies(K, [0.25, 7.0])
     path = newton.NewtonPath(bodies=bodies, cells=None, gaps=None, reference=None)
-    rows = SimpleNamespace(B=csr_array((0, 2)), place=np.zeros(0, dtype=int))
+    none = np.zeros(0, dtype=int)
+    rows = ContactRows(*[csr_array((0, 2)), none] * 2, *[none] * 4)
     at = SimpleNamespace(u=np.array([1.0, -3.0]), rows=rows)
     posed = SimpleNamespace(tangent=bodies, load_factor=2.0)
     bound = path._rounding(at, np.zeros(0), posed)
@@ -577,11 +579,9 @@ def test_contact_stiffness_is_requested_in_units_and_stored_without_units():
 
     bodies = SimpleNamespace(length=2.0, force=8.0)
     path = newton.NewtonPath(bodies=bodies, cells=None, gaps=None, reference=None)
-    at = SimpleNamespace(
-        u=np.array([1.0, 2.0, 3.0]), rows=SimpleNamespace(place=np.array([1, 2]))
-    )
+    at = SimpleNamespace(u=np.array([1.0, 2.0, 3.0]), rows=None)
     K = path._contact_stiffness(at, np.array([9.0, 0.5, 0.25]), curvature).toarray()
-    assert asked == [([2.0, 4.0, 6.0], [4.0, 2.0])]
+    assert asked == [([2.0, 4.0, 6.0], [72.0, 4.0, 2.0])]
     assert (K == np.array([[7, 0, 2], [0, 0, 0], [2, 0, 1]]) / 4).all()
 
 

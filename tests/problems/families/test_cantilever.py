@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 import mortarbench as mb
 from mortarbench.harness import InputError, no_rows
 from mortarbench.problems.contact.bodies import assemble, factorise_clamped
-from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality.newton_case import newton_path
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, rectangle
@@ -170,7 +170,9 @@ def test_for_small_loads_finite_and_linear_displacements_differ_by_their_square(
 
 def no_contact(bodies):
     n, none = bodies.mesh.dofs, np.zeros(0, dtype=np.int64)
-    rows = ContactRows(no_rows(n), np.zeros(0), no_rows(n), none, np.zeros(0), none)
+    rows = ContactRows(
+        no_rows(n), np.zeros(0), no_rows(n), none, np.zeros(0), none, np.zeros(0), none
+    )
     return lambda u: rows
 
 

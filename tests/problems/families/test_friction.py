@@ -14,10 +14,7 @@ from mortarbench.problems.contact.balance import check_balance
 from mortarbench.problems.contact.bodies import ContactPair, assemble, factorise_clamped
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.node_to_segment import (
-    ContactRows,
-    rows_along,
-)
+from mortarbench.problems.contact.rows import ContactRows, rows_along
 from mortarbench.problems.contact.surface import tangents
 from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.fem.elasticity import Material
@@ -345,7 +342,7 @@ def test_a_divergent_fixed_point_iteration_ends_with_its_last_residual(load):
     B = rows_along(tip[:, None], one, normal, mesh.dofs)
     T = rows_along(tip[:, None], one, tangents(normal)[:, 0], mesh.dofs)
     first = np.zeros(1, dtype=np.int64)
-    rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first)
+    rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first, np.ones(1), first)
     laws = (FrictionLaw("coulomb", mu=0.5),)
     path = load_path(
         bodies, lambda u: rows, lambda: factorise_clamped(bodies),

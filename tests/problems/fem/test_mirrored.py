@@ -72,12 +72,13 @@ def load_path(bodies, contact, basis, relin=1):
 @cache
 def results(bodies, contact, basis, form):
     """Solve the QP of the last step in `form`; return u in m, and SI quantities."""
-    primal = load_path(bodies, contact, basis).primal(STEPS)
+    last = load_path(bodies, contact, basis).problem(STEPS).problem
+    primal, rows = last.primal, last.rows
     case = contact_case(
-        bodies, primal, form, floating=lambda: factorise_floating(bodies),
+        bodies, primal, rows, form, floating=lambda: factorise_floating(bodies),
         clamped=lambda: factorise_clamped(bodies),
         supported=lambda: factorise_clamped(bodies),
-        quantities=lambda s: quantities(bodies, primal, s),
+        quantities=lambda s: quantities(bodies, primal, s, rows),
     )  # fmt: skip
     s = SMALBE().prepare(case.qp, 1e-12)()
     values = dict(case.quantities(s))

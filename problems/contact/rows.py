@@ -1,0 +1,328 @@
+"""Contact rows B u ≤ c of one or several pairs of sides, and operations on them.
+
+Every slave node has at most one row per pair. If several pairs have the same row at a
+common slave node, such as where two named parts of a side meet, this row has a single
+multiplier, and its force is divided among the pairs in proportion to the areas by which
+they cover the node.
+
+*Border of the master.* The row of a slave node acts between the node and its closest
+point on the master. If the node is beyond the border of the master, the line between
+the two points is not normal to the master, and the forces of such a row would have a
+moment. Two rules keep the forces in equilibrium:
+
+- Up to `EXTENSION` beyond the border, the node is opposite the extended plane of the
+  master's last facet (as in the extension zone of Abaqus).
+- If a facet of the slave has a node farther beyond, the rows of its nodes contain the
+  integral over the part of the facet that the master covers. With the basis N_j of
+  mortar contact, the row of node j is
+
+      Σ_e ∫_e N_j g  ≥  0,   where  ∫_e N_j g ≈ g_j ∫_e N_j  on all other facets.
+
+A node beyond the border by more than the radius of its facets (half the length of a
+segment, or the distance of the corners of a face from its centre) has no row, because
+its row would hardly differ from that of its neighbour. In the integrals, its N_j is
+added to those of the nodes with a row in its facets, so that the functions of all rows
+sum to one, and the areas of all rows to the covered area.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
+
+from mortarbench.harness import Vector
+from mortarbench.problems.contact.surface import Points, Surface, tangents
+from mortarbench.problems.fem.mesh import Nodes, dofs_of
+
+#: distance by which a slave node may be beyond the border of its master and still have
+#: a nodal row, relative to the smaller radius of a facet of both sides: a tenth of the
+#: length of a segment, the default of Abaqus
+EXTENSION = 0.2
+#: two rows of a slave node are the same if their entries differ by at most this value,
+#: and their gaps by at most this fraction of the size of the bodies
+SAME_ROW = 1e-9
+#: entries of a row at free components whose sum is at most this fraction of the sum of
+#: all entries count as rounding errors of the normal
+MIN_FREE = 1e-12
+
+
+class ContactRows(NamedTuple):
+    """Contact rows B u ≤ c for the total displacement u, and rows of the slip T u.
+
+    The last four arrays have one entry for each slave node with a row (for each pair).
+    """
+
+    B: csr_array  #: (m, n) B_M of eq. (5), dimensionless
+    c: Vector  #: (m,) c_M of eq. (5), m
+    T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row with friction
+    row: Nodes  #: (k,) contact row of each tangential row
+    #: (e,) ∫N_j over the slave side (for mortar contact, over its covered part, and
+    #: with the weight |ν| in 2D), the length in m (2D) or the area in m² (3D) that is
+    #: assigned to the row
+    share: Vector
+    #: (e,) index of the slave node in `ContactPair.slave_nodes`; with several pairs, in
+    #: the concatenation of these arrays
+    place: Nodes
+    #: (e,) fraction of the node's length or area that is opposite the master
+    covered: Vector
+    at: Nodes  #: (e,) contact row of each entry
+
+    def of_rows(self, values: Vector) -> Vector:
+        """Return the sums (m,) over the slave nodes of each row.
+
+        values : (e,) value of each entry
+        """
+        return np.bincount(self.at, values, minlength=self.c.size).astype(float)
+
+    def at_places(self, force: Vector, places: int) -> Vector:
+        """Return the force (places,) of each slave node; zero if it has no row.
+
+        force : (m,) force of each row, which is divided in proportion to `share`
+        """
+        at_place = np.zeros(places)
+        share = self.share / self.of_rows(self.share)[self.at]
+        at_place[self.place] = force[self.at] * share
+        return at_place
+
+    def resultants(self, nodes: Nodes, dim: int) -> Points:
+        """Return the sums (m, dim) of the entries of each row at some nodes."""
+        sums = [self.B[:, dofs_of(nodes, dim, axis)].sum(axis=1) for axis in range(dim)]
+        return np.stack(sums, axis=1)
+
+    def selected(self, keep: NDArray[np.bool_]) -> ContactRows:
+        """Return the rows in a mask (m,), with their tangential rows and entries."""
+        number = np.cumsum(keep) - 1
+        slips, entries = keep[self.row], keep[self.at]
+        return ContactRows(
+            self.B[keep],
+            self.c[keep],
+            self.T[slips],
+            number[self.row[slips]],
+            self.share[entries],
+            self.place[entries],
+            self.covered[entries],
+            number[self.at[entries]],
+        )
+
+
+class SlaveNodes(NamedTuple):
+    """Slave nodes of a pair."""
+
+    number: Nodes  #: (s,) numbers
+    x: Points  #: (s, dim) positions X + u^k, m
+    areas: Vector  #: (s,) lengths or areas ∫N_j of the slave side, m or m²
+
+
+class Feet(NamedTuple):
+    """Closest points of all s slave nodes on the master, which may be extended."""
+
+    node: Nodes  #: (s, a) nodes of the master facet with the closest point
+    #: (s, a) shape functions of these nodes at this point; extrapolated beyond a border
+    N: NDArray[np.float64]
+    x: Points  #: (s, dim) position, m
+    normal: Points  #: (s, dim) outward unit normal of the master
+    #: (s,) distance along the master by which a node is beyond its border, m; else 0
+    beyond: Vector
+    radius: Vector  #: (s,) radius of the master facet, m
+
+
+def nodal_rows(
+    u: Vector,
+    slave: SlaveNodes,
+    feet: Feet,
+    side: Callable[[], Surface],
+    integral: Callable[..., ContactRows],
+    *,
+    tangential: bool,
+) -> ContactRows:
+    """Return one row per slave node, except for nodes beyond the border of the master.
+
+    Parameters
+    ----------
+    u : (n,) displacement u^k at which to linearise, m
+    side : function that returns the slave side at X + u^k
+    integral : function that returns the mortar rows, with the basis N_j, of the slave
+        facets in a mask `part` (f,)
+    tangential : add tangential rows for friction
+
+    """
+    s, dim = slave.x.shape
+    gap = np.einsum("sx,sx->s", slave.x - feet.x, feet.normal)
+    # stencil of each row: the slave node and the nodes of the master facet
+    node = np.column_stack([slave.number, feet.node])
+    weight = np.column_stack([-np.ones(s), feet.N])
+    B = rows_along(node, weight, feet.normal, u.size)
+    # friction rows have the weights of their contact row, along the tangents
+    along = tangents(feet.normal)[: s if tangential else 0]
+    row, every = np.repeat(np.arange(len(along)), dim - 1), np.arange(s)
+    T = rows_along(node[row], weight[row], along.reshape(-1, dim), u.size)
+    rows = ContactRows(B, gap + B @ u, T, row, slave.areas, every, np.ones(s), every)
+    if feet.beyond.any():
+        radius = np.minimum(side().radius, feet.radius)
+        outside = feet.beyond > EXTENSION * radius
+        if outside.any():
+            return _with_integrals(rows, side(), outside, integral)
+    return rows
+
+
+def _with_integrals(
+    nodal: ContactRows,
+    side: Surface,
+    outside: NDArray[np.bool_],
+    integral: Callable[..., ContactRows],
+) -> ContactRows:
+    """Integrate over the slave facets with a node beyond the border of the master.
+
+    Parameters
+    ----------
+    nodal : rows of all slave nodes
+    outside : (s,) mask of the nodes beyond the border
+
+    """
+    s, areas = nodal.c.size, side.areas
+    cut = np.asarray(outside[side.facets].any(axis=1))
+    part, whole = integral(part=cut), areas.copy()
+    bordered = np.unique(side.facets[cut])
+    whole[bordered] = side.areas_in(~cut)[bordered]
+    whole[outside] = 0.0
+    covered = np.zeros((2, s))  # ∫N_j on the cut facets, as in `share` and in `covered`
+    covered[:, part.place] = part.share, part.covered * areas[part.place]
+    # a node whose facets are covered only at an angle beyond that of the integrals
+    alone = ~outside & (whole + covered[0] == 0)
+    whole[alone] = areas[alone]
+    # the rows are V · nodal + W · part, with weights that sum to one
+    kept = whole + covered[0] > 0
+    total = np.where(kept, whole + covered[0], 1.0)
+    V = diags_array(whole / total)
+    weight = part.share / total[part.place]
+    shape = (s, part.place.size)
+    W = csr_array((weight, (part.place, np.arange(part.place.size))), shape=shape)
+    one = eye_array(nodal.T.shape[0] // s)
+    area = whole + covered[1]
+    return ContactRows(
+        B=csr_array(V @ nodal.B + W @ part.B),
+        c=V @ nodal.c + W @ part.c,
+        T=csr_array(kron(V, one) @ nodal.T + kron(W, one) @ part.T),
+        row=nodal.row,
+        share=area,
+        place=nodal.place,
+        covered=area / areas,
+        at=nodal.at,
+    ).selected(kept)
+
+
+def without_outer(rows: ContactRows, side: Surface, beyond: Vector) -> ContactRows:
+    """Add the functions N_j of nodes far beyond the border of the master to others.
+
+    Parameters
+    ----------
+    rows : one mortar row for each covered node
+    side : slave side at X + u^k
+    beyond : (s,) distances of the nodes beyond the border, see `Feet`
+
+    """
+    s, place, facets = beyond.size, rows.place, side.facets
+    kept = np.zeros(s, dtype=bool)
+    kept[place] = beyond[place] <= side.radius[place]
+    if kept[place].all():
+        return rows
+    # E (s, s) divides the function of a node among the nodes with a row in its facets
+    i = np.repeat(facets, facets.shape[1], axis=1).ravel()
+    j = np.tile(facets, (1, facets.shape[1])).ravel()
+    given = kept[i] & ~kept[j]
+    E = csr_array((np.ones(given.sum()), (i[given], j[given])), shape=(s, s))
+    E.data[:] = 1.0
+    E.data /= np.bincount(E.indices, minlength=s)[E.indices]
+    E = csr_array(E + diags_array(kept.astype(float)))[kept][:, place]
+    share, areas = E @ rows.share, side.areas
+    W = csr_array(diags_array(1 / share) @ E @ diags_array(rows.share))
+    per_row, every = rows.T.shape[0] // place.size, np.arange(share.size)
+    return ContactRows(
+        B=csr_array(W @ rows.B),
+        c=W @ rows.c,
+        T=csr_array(kron(W, eye_array(per_row)) @ rows.T),
+        row=np.repeat(every, per_row),
+        share=share,
+        place=np.flatnonzero(kept),
+        covered=E @ (rows.covered * areas[place]) / areas[kept],
+        at=every,
+    )
+
+
+def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:
+    """Assemble rows of weighted displacements along a direction, (m, size).
+
+    Row r has the entries weight_ra · direction_r at the components of node_ra, for
+    `node` and `weight` (m, k) and `direction` (m, dim). Zeros are not stored.
+    """
+    (m, k), dim = node.shape, direction.shape[1]
+    if not m:
+        return csr_array((0, size))
+    values = weight[:, :, None] * direction[:, None, :]
+    indptr = dim * k * np.arange(m + 1)
+    B = csr_array((values.ravel(), dofs_of(node, dim), indptr), shape=(m, size))
+    B.sum_duplicates()
+    B.eliminate_zeros()
+    return B
+
+
+def joined(
+    parts: Sequence[ContactRows], nodes: Sequence[Nodes], size: float
+) -> ContactRows:
+    """Join the rows of several pairs; equal rows of a common slave node become one.
+
+    nodes : slave nodes of each pair
+    size : size of the bodies, relative to which gaps are compared, m
+    """
+    first_row = np.cumsum([0, *(part.c.size for part in parts)])
+    first_place = np.cumsum([0, *(one.size for one in nodes)])
+
+    def numbered(name: str, first: Nodes) -> Nodes:
+        values = (getattr(p, name) + k for p, k in zip(parts, first, strict=False))
+        return np.concatenate(list(values))
+
+    rows = ContactRows(
+        B=csr_array(vstack([part.B for part in parts])),
+        c=np.concatenate([part.c for part in parts]),
+        T=csr_array(vstack([part.T for part in parts])),
+        row=numbered("row", first_row),
+        share=np.concatenate([part.share for part in parts]),
+        place=numbered("place", first_place),
+        covered=np.concatenate([part.covered for part in parts]),
+        at=numbered("at", first_row),
+    )
+    # sort by slave node, so that rows of a common node follow each other
+    node = np.concatenate(list(nodes))[rows.place]
+    order = np.argsort(node, kind="stable")
+    before, after = rows.at[order[:-1]], rows.at[order[1:]]
+    common = np.flatnonzero(node[order[:-1]] == node[order[1:]])
+    i, j = before[common], after[common]
+    slips = np.isin(np.arange(rows.c.size), rows.row)
+    same = np.full(common.size, False)
+    if common.size:
+        same = abs(rows.B[i] - rows.B[j]).max(axis=1).toarray().ravel() <= SAME_ROW
+        same &= np.abs(rows.c[i] - rows.c[j]) <= SAME_ROW * size
+        same &= slips[i] == slips[j]  # otherwise the friction of one would be lost
+    leader = np.arange(rows.c.size)
+    for first, second in zip(i[same], j[same], strict=True):
+        leader[second] = leader[first]
+    keep = leader == np.arange(leader.size)
+    return rows._replace(at=leader[rows.at]).selected(keep)
+
+
+def without_fixed(rows: ContactRows, fixed: Nodes) -> ContactRows:
+    """Return the rows with an entry at a free component.
+
+    If supports prescribe all components of a row, its multiplier is a force between
+    supports, which no equation determines.
+
+    fixed : components that supports prescribe
+    """
+    free = np.ones(rows.B.shape[1])
+    free[fixed] = 0.0
+    size = abs(rows.B)
+    return rows.selected(size @ free > MIN_FREE * size.sum(axis=1))
