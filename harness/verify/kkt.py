@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -425,7 +426,8 @@ def diagnosis(qp: QP, s: Solution, tol: float) -> str:
             return f"{name} contains {'NaN' if np.isnan(value) else 'inf'}"
     if kkt_residuals(qp, s).worst <= (most := allowed(tol)):
         return ""
-    for names in (("z",), ("z_box",), ("y",), ("z", "z_box"), ("y", "z", "z_box")):
+    duals = [name for name in ("y", "z", "z_box") if getattr(s, name).any()]
+    for names in (c for k in (1, 2, 3) for c in combinations(duals, k)):
         flipped = replace(s, **{name: -getattr(s, name) for name in names})
         if kkt_residuals(qp, flipped).worst <= most:
             signs = " and ".join(f"−{name}" for name in names)
@@ -433,7 +435,10 @@ def diagnosis(qp: QP, s: Solution, tol: float) -> str:
                 f"with {signs} all residuals vanish: check the sign of "
                 f"{' and '.join(names)}"
             )
-    one = max(_errors(qp, s), key=lambda one: one.ratios.max(initial=0.0))
+    one = max(  # NaN is the largest: terms of a finite point may overflow
+        _errors(qp, s),
+        key=lambda one: float(np.nan_to_num(one.ratios.max(initial=0.0), nan=np.inf)),
+    )
     at, ratio = int(one.ratios.argmax()), f"{one.ratios.max():.1e}"
     number = at if one.number is None else int(one.number[at])
     match one.residual:
