@@ -215,7 +215,7 @@ def _sizes_at(qp: QP, x: Vector, Px: Vector) -> _Sizes:
     by = scaling_of(qp)
     pmax, size = _sup(by.D**2 * by.curvature), (x / by.D)[by.used]
     loads = by.D * qp.q
-    least = length_unit(qp)
+    least = _length_unit(qp)
     X, mean = max(_sup(size), least), max(_rms(size), least)
     F = max(_sup(by.D * Px), _sup(loads))
     return _Sizes(
@@ -227,14 +227,20 @@ def _sizes_at(qp: QP, x: Vector, Px: Vector) -> _Sizes:
     )
 
 
-def length_unit(qp: QP) -> float:
-    """Return ℓ of `kkt_residuals`: the least nonzero length in the data of a QP."""
+def lengths(qp: QP) -> Vector:
+    """Return the nonzero |b̂|, |ĥ|, finite bounds and radii of a QP, in no order."""
     by, origin = scaling_of(qp), np.zeros(qp.q.size)
     limits = (c for one in qp.sets for c in one.limits(origin))
     data = [by.E * np.abs(qp.b), by.F * np.abs(qp.h)]
-    lengths = np.concatenate([*data, *(c.size / by.D[c.variable] for c in limits)])
-    if lengths.any():
-        return float(lengths[lengths > 0].min())
+    found = np.concatenate([*data, *(c.size / by.D[c.variable] for c in limits)])
+    return found[found > 0]
+
+
+def _length_unit(qp: QP) -> float:
+    """Return ℓ of `kkt_residuals`: the least length in the data of a QP."""
+    if (found := lengths(qp)).size:
+        return float(found.min())
+    by = scaling_of(qp)
     pmax = _sup(by.D**2 * by.curvature)
     return _sup(by.D * qp.q) / pmax if pmax and qp.q.any() else 1.0
 
