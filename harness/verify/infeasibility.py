@@ -6,8 +6,10 @@ c = Aᵀy + Gᵀz, prove that no point of the box with ‖x̂‖∞ ≤ T satisf
     g = −bᵀy − hᵀz + Σ min(cⱼxⱼ over the box and |x̂ⱼ| ≤ T) > 0,
 
 since cᵀx ≤ bᵀy + hᵀz for every x that satisfies the rows (Farkas' lemma). The radius
-T = max(1, ℓ)/tol is so large that a point beyond it is of no use at the tolerance; for
-T = ∞, rounding errors of c without a bound would make every proof impossible.
+T = L/tol, where L is the largest length in the data, is so large that a point beyond
+it is of no use at the tolerance; for T = ∞, rounding errors of c without a bound
+would make every proof impossible. c is evaluated in extended precision, and a bound of
+its rounding error, which T multiplies, is subtracted.
 
 Unbounded: a ray r with qᵀr < 0, Pr = 0 in the recession cone of the feasible set, and a
 feasible point. A ray alone proves only that the dual QP is infeasible.
@@ -23,8 +25,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array, hstack, vstack
+from scipy.sparse import coo_array, csr_array, diags_array, hstack, vstack
 
+from mortarbench.harness.mechanics import Real
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.convex import hull
@@ -32,7 +35,7 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import (
     allowed,
     kkt_residuals,
-    length_unit,
+    lengths,
     scaling_of,
 )
 
@@ -40,6 +43,10 @@ from mortarbench.harness.verify.kkt import (
 #: that are consistent before rounding may contradict one another by a smaller margin if
 #: their right-hand sides are rounded sums of thousands of terms.
 MIN_MARGIN = 1e-12
+#: Largest deviation of a ray from the recession cone and from Pr = 0. It is that of the
+#: linear program, and independent of the tolerance: a ray with larger deviations may
+#: belong to a bounded QP whose solution is long.
+RAY_ACCURACY = 1e-10
 MAX_ENTRIES = 10**6  #: largest number of entries of the linear programs
 LP_SECONDS = 20.0  #: time limit of each linear program
 NO_POINT = "a ray of descent, but no feasible point: only the dual QP is infeasible"
@@ -57,7 +64,7 @@ def certificate_of(qp: QP, s: Solution, tol: float) -> tuple[bool, str]:
             if (margin := farkas_margin(qp, y, z, tol)) > MIN_MARGIN:
                 return True, f"Farkas certificate with a margin of {margin:.1e}"
         return False, "no certificate of infeasibility was found"
-    if not any(is_ray(qp, r, tol) for r in _rays(qp, s)):
+    if not any(is_ray(qp, r) for r in _rays(qp, s)):
         return False, "no ray of unbounded descent was found"
     if not any(_is_feasible(qp, x, tol) for x in _points(qp, s)):
         return False, NO_POINT
@@ -67,35 +74,53 @@ def certificate_of(qp: QP, s: Solution, tol: float) -> tuple[bool, str]:
 def farkas_margin(qp: QP, y: Vector, z: Vector, tol: float) -> float:
     """Return g divided by the sum of its absolute terms, or −1 for invalid z.
 
-    A positive margin proves that no point with ‖x̂‖∞ ≤ max(1, ℓ)/tol is feasible.
+    A positive margin proves that no point with ‖x̂‖∞ ≤ L/tol is feasible.
     """
     if (z < 0).any() or not (np.isfinite(y).all() and np.isfinite(z).all()):
         return -1.0
-    by, (lower, upper) = scaling_of(qp), hull(qp.sets, qp.q.size)
-    reach = by.D * max(1.0, length_unit(qp)) / tol
-    c = qp.A.T @ y + qp.G.T @ z
+    lower, upper = hull(qp.sets, qp.q.size)
+    reach = scaling_of(qp).D * _longest(qp) / tol
     ends = np.maximum(lower, -reach), np.minimum(upper, reach)
     if (ends[0] > ends[1]).any():  # a bound is beyond the radius
         return -1.0
+    c, error = _combined(qp, np.concatenate([y, z]))
     work = np.minimum(c * ends[0], c * ends[1])
-    g = -(qp.b @ y) - qp.h @ z + work.sum()
+    rounding = error @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    g = -(qp.b @ y) - qp.h @ z + work.sum() - rounding
     terms = np.abs(qp.b) @ np.abs(y) + np.abs(qp.h) @ z + np.abs(work).sum()
     return float(g / terms) if terms > 0 else -1.0
 
 
-def is_ray(qp: QP, r: Vector, tol: float) -> bool:
+def _combined(qp: QP, w: Vector) -> tuple[Any, Any]:
+    """Return [A; G]ᵀw (n,) in extended precision, and bounds (n,) of its rounding."""
+    K = coo_array(vstack([csr_array(qp.A), csr_array(qp.G)]))
+    terms = K.data.astype(Real) * w[K.row]
+    c, sizes = np.zeros((2, qp.q.size), dtype=Real)
+    np.add.at(c, K.col, terms)
+    np.add.at(sizes, K.col, np.abs(terms))
+    count = 1 + np.bincount(K.col, minlength=c.size)  # roundings of each sum
+    return c, count * np.finfo(Real).eps * sizes
+
+
+def _longest(qp: QP) -> float:
+    """Return L, the largest length in the data; 1 if there is none."""
+    return float(lengths(qp).max(initial=0.0)) or 1.0
+
+
+def is_ray(qp: QP, r: Vector) -> bool:
     """Return True if the objective decreases without bound along r (n,).
 
-    With ‖r̂‖∞ = 1 and the slope σ = −q̂ᵀr̂ > 0, this requires ‖P̂r̂‖∞ ≤ 10·tol·σ, and that
-    r leaves the recession cone by at most tol·min(1, σ/‖q̂‖∞) in each scaled row, bound
-    or set.
+    With ‖r̂‖∞ = 1 and the slope σ = −q̂ᵀr̂ > 0, r may leave the recession cone by at most
+    ε·min(1, σ/‖q̂‖∞) in each scaled row, bound or set, with ε = `RAY_ACCURACY`, and
+    ‖P̂r̂‖∞ ≤ εσ/R with R = max(L, ‖q̂‖∞/max P̂ⱼⱼ). The objective is then linear along r
+    up to a distance R/ε, where R is the largest length that the data define.
     """
     by = scaling_of(qp)
     size = float(np.abs(r / by.D).max())
     if not 0 < size < np.inf:
         return False
     r = r / size
-    slope, lower, upper = -float(qp.q @ r), *hull(qp.sets, r.size)
+    slope, (lower, upper) = -float(qp.q @ r), hull(qp.sets, r.size)
     if not slope > MIN_MARGIN * (np.abs(qp.q) @ np.abs(r)):
         return False
     leaving = [
@@ -110,7 +135,11 @@ def is_ray(qp: QP, r: Vector, tol: float) -> bool:
     largest = max(float(v.max(initial=0.0)) for v in leaving)
     bend = float(np.abs(by.D * (qp.P @ r)).max())
     steepest = float(np.abs(by.D * qp.q).max())
-    return largest <= tol * min(1.0, slope / steepest) and bend <= allowed(tol) * slope
+    stiffest = float((by.D**2 * by.curvature).max())
+    if largest > RAY_ACCURACY * min(1.0, slope / steepest):
+        return False
+    reach = max(_longest(qp), steepest / stiffest if stiffest else 0.0) / RAY_ACCURACY
+    return bend * reach <= slope
 
 
 def _is_feasible(qp: QP, x: Vector, tol: float) -> bool:
@@ -128,25 +157,29 @@ def _farkas_candidates(qp: QP, s: Solution) -> Iterator[tuple[Vector, Vector]]:
 def _points(qp: QP, s: Solution) -> Iterator[Vector]:
     yield s.x
     if (least := _least_violation(qp)) is not None:
-        yield least[0]
+        x = least[0]
+        for one in qp.sets:
+            x = one.project(x)
+        yield x
 
 
 def _least_violation(qp: QP) -> tuple[Vector, Vector, Vector] | None:
     """Return the point in the box that violates scaled rows least, and multipliers.
 
-    The linear program minimises t subject to −t ≤ E(Ax − b) ≤ t and F(Gx − h) ≤ t. If
-    the least t is positive, the multipliers y, z of the rows are those of a Farkas
-    certificate with g = t.
+    The linear program minimises t subject to −t ≤ E(Ax − b)/L ≤ t and F(Gx − h)/L ≤ t.
+    If the least t is positive, the multipliers y, z of the rows are those of a Farkas
+    certificate with g = tL.
     """
     by, n, (lower, upper) = scaling_of(qp), qp.q.size, hull(qp.sets, qp.q.size)
+    D = by.D * _longest(qp)
     A, G = (csr_array(diags_array(e) @ csr_array(M) @ diags_array(by.D))
             for e, M in ((by.E, qp.A), (by.F, qp.G)))  # fmt: skip
     K = vstack([A, -A, G])
-    bounds = np.stack([np.append(lower / by.D, 0), np.append(upper / by.D, np.inf)])
+    bounds = np.stack([np.append(lower / D, 0), np.append(upper / D, np.inf)])
     solved = _linear_program(
         np.append(np.zeros(n), 1.0),
         csr_array(hstack([K, np.full((K.shape[0], 1), -1.0)])),
-        np.concatenate([by.E * qp.b, -by.E * qp.b, by.F * qp.h]),
+        np.concatenate([by.E * qp.b, -by.E * qp.b, by.F * qp.h]) / _longest(qp),
         None,
         bounds,
     )
@@ -154,7 +187,7 @@ def _least_violation(qp: QP) -> tuple[Vector, Vector, Vector] | None:
         return None
     w, m = -solved.ineqlin.marginals, qp.b.size
     y, z = by.E * (w[:m] - w[m : 2 * m]), by.F * np.maximum(w[2 * m :], 0)
-    return by.D * solved.x[:n], y, z
+    return D * solved.x[:n], y, z
 
 
 def _rays(qp: QP, s: Solution) -> Iterator[Vector]:

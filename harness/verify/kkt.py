@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -214,7 +215,7 @@ def _sizes_at(qp: QP, x: Vector, Px: Vector) -> _Sizes:
     by = scaling_of(qp)
     pmax, size = _sup(by.D**2 * by.curvature), (x / by.D)[by.used]
     loads = by.D * qp.q
-    least = length_unit(qp)
+    least = _length_unit(qp)
     X, mean = max(_sup(size), least), max(_rms(size), least)
     F = max(_sup(by.D * Px), _sup(loads))
     return _Sizes(
@@ -226,14 +227,20 @@ def _sizes_at(qp: QP, x: Vector, Px: Vector) -> _Sizes:
     )
 
 
-def length_unit(qp: QP) -> float:
-    """Return ℓ of `kkt_residuals`: the least nonzero length in the data of a QP."""
+def lengths(qp: QP) -> Vector:
+    """Return the nonzero |b̂|, |ĥ|, finite bounds and radii of a QP, in no order."""
     by, origin = scaling_of(qp), np.zeros(qp.q.size)
     limits = (c for one in qp.sets for c in one.limits(origin))
     data = [by.E * np.abs(qp.b), by.F * np.abs(qp.h)]
-    lengths = np.concatenate([*data, *(c.size / by.D[c.variable] for c in limits)])
-    if lengths.any():
-        return float(lengths[lengths > 0].min())
+    found = np.concatenate([*data, *(c.size / by.D[c.variable] for c in limits)])
+    return found[found > 0]
+
+
+def _length_unit(qp: QP) -> float:
+    """Return ℓ of `kkt_residuals`: the least length in the data of a QP."""
+    if (found := lengths(qp)).size:
+        return float(found.min())
+    by = scaling_of(qp)
     pmax = _sup(by.D**2 * by.curvature)
     return _sup(by.D * qp.q) / pmax if pmax and qp.q.any() else 1.0
 
@@ -425,7 +432,8 @@ def diagnosis(qp: QP, s: Solution, tol: float) -> str:
             return f"{name} contains {'NaN' if np.isnan(value) else 'inf'}"
     if kkt_residuals(qp, s).worst <= (most := allowed(tol)):
         return ""
-    for names in (("z",), ("z_box",), ("y",), ("z", "z_box"), ("y", "z", "z_box")):
+    duals = [name for name in ("y", "z", "z_box") if getattr(s, name).any()]
+    for names in (c for k in (1, 2, 3) for c in combinations(duals, k)):
         flipped = replace(s, **{name: -getattr(s, name) for name in names})
         if kkt_residuals(qp, flipped).worst <= most:
             signs = " and ".join(f"−{name}" for name in names)
@@ -433,7 +441,10 @@ def diagnosis(qp: QP, s: Solution, tol: float) -> str:
                 f"with {signs} all residuals vanish: check the sign of "
                 f"{' and '.join(names)}"
             )
-    one = max(_errors(qp, s), key=lambda one: one.ratios.max(initial=0.0))
+    one = max(  # NaN is the largest: terms of a finite point may overflow
+        _errors(qp, s),
+        key=lambda one: float(np.nan_to_num(one.ratios.max(initial=0.0), nan=np.inf)),
+    )
     at, ratio = int(one.ratios.argmax()), f"{one.ratios.max():.1e}"
     number = at if one.number is None else int(one.number[at])
     match one.residual:

@@ -87,7 +87,7 @@ def nearly_contradicting(rng):
         kind = rng.integers(0, 5, n)
         bound[kind == 1] = x[kind == 1]
         bound[kind == 2] = (x + sign)[kind == 2]
-        bound[kind == 3] = sign * 1e20
+        bound[kind == 3] = sign * 1e12
         if free:
             bound[rng.random(n) < 0.7] = sign * np.inf
     row = 10.0 ** rng.choice([0, 0, -8, 8], m + p)
