@@ -348,8 +348,8 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
             reasons.append(
                 "friction forces are not unique: where supports or other contact rows "
                 "prevent slip, other friction forces have the same displacements, so "
-                "that sums such as friction_force depend on the solver; remove "
-                "friction there, or the supports along the contact"
+                "that sums such as friction_force depend on the solver; remove the "
+                "friction or the supports along the contact"
             )
     with suppress(Exception), one_thread():
         reasons += _large_displacements(case, solution)

@@ -172,7 +172,7 @@ def mortar(
         integrals.covered[j] / s.areas[j],
         np.arange(j.size),
     )
-    return without_outer(rows, s, closest_points(s.x, m).beyond)
+    return without_outer(rows, s, closest_points(s.x, m).beyond, part)
 
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:

@@ -18,11 +18,12 @@ moment. Two rules keep the forces in equilibrium:
 
       Σ_e ∫_e N_j g  ≥  0,   where  ∫_e N_j g ≈ g_j ∫_e N_j  on all other facets.
 
-A node beyond the border by more than the radius of its facets (half the length of a
-segment, or the distance of the corners of a face from its centre) has no row, because
-its row would hardly differ from that of its neighbour. In the integrals, its N_j is
-added to those of the nodes with a row in its facets, so that the functions of all rows
-sum to one, and the areas of all rows to the covered area.
+A node beyond the border of which the master covers less than `BARELY` times the area
+that it covers of a neighbour has no row, because small forces would cause large
+pressures there. At a straight border, this applies to nodes that are more than half a
+facet beyond. In the integrals, N_j is added to the functions of the nodes with a row in
+its facets, so that the functions of all rows sum to one, and the areas of all rows to
+the covered area.
 """
 
 from __future__ import annotations
@@ -42,6 +43,10 @@ from mortarbench.problems.fem.mesh import Nodes, dofs_of
 #: a nodal row, relative to the smaller radius of a facet of both sides: a tenth of the
 #: length of a segment, the default of Abaqus
 EXTENSION = 0.2
+#: smallest ratio of the covered areas of neighbouring slave nodes with rows, if one of
+#: them is beyond the border of the master. On a uniform chain, the ratio is (θ²/2) /
+#: (1/2 + θ − θ²/2) if the fraction θ of the last segment is covered, and 1/7 for θ = ½
+BARELY = 1 / 7
 #: two rows of a slave node are the same if their entries differ by at most this value,
 #: and their gaps by at most this fraction of the size of the bodies
 SAME_ROW = 1e-9
@@ -215,19 +220,28 @@ def _with_integrals(
     ).selected(kept)
 
 
-def without_outer(rows: ContactRows, side: Surface, beyond: Vector) -> ContactRows:
-    """Add the functions N_j of nodes far beyond the border of the master to others.
+def without_outer(
+    rows: ContactRows,
+    side: Surface,
+    beyond: Vector,
+    part: NDArray[np.bool_] | None = None,
+) -> ContactRows:
+    """Add the functions N_j of nodes that the master barely covers to those of others.
 
     Parameters
     ----------
     rows : one mortar row for each covered node
     side : slave side at X + u^k
     beyond : (s,) distances of the nodes beyond the border, see `Feet`
+    part : mask (f,) of the facets of `rows`; the master covers all others
 
     """
-    s, place, facets = beyond.size, rows.place, side.facets
-    kept = np.zeros(s, dtype=bool)
-    kept[place] = beyond[place] <= side.radius[place]
+    s, place, facets, areas = beyond.size, rows.place, side.facets, side.areas
+    covered, most = np.zeros(s), np.zeros(s)
+    covered[place] = rows.covered * areas[place]
+    area = covered if part is None else covered + side.areas_in(~part)
+    np.maximum.at(most, facets, area[facets].max(axis=1, keepdims=True))
+    kept = (covered > 0) & ((beyond == 0) | (area >= BARELY * most))
     if kept[place].all():
         return rows
     # E (s, s) divides the function of a node among the nodes with a row in its facets
@@ -238,7 +252,7 @@ def without_outer(rows: ContactRows, side: Surface, beyond: Vector) -> ContactRo
     E.data[:] = 1.0
     E.data /= np.bincount(E.indices, minlength=s)[E.indices]
     E = csr_array(E + diags_array(kept.astype(float)))[kept][:, place]
-    share, areas = E @ rows.share, side.areas
+    share = E @ rows.share
     W = csr_array(diags_array(1 / share) @ E @ diags_array(rows.share))
     per_row, every = rows.T.shape[0] // place.size, np.arange(share.size)
     return ContactRows(
@@ -248,7 +262,7 @@ def without_outer(rows: ContactRows, side: Surface, beyond: Vector) -> ContactRo
         row=np.repeat(every, per_row),
         share=share,
         place=np.flatnonzero(kept),
-        covered=E @ (rows.covered * areas[place]) / areas[kept],
+        covered=E @ covered[place] / areas[kept],
         at=every,
     )
 

@@ -175,7 +175,7 @@ def face_mortar(
         (cover / _integrals_of(own))[active],
         np.arange(active.size),
     )
-    return without_outer(covered, s, closest_points(s.x, other).beyond)
+    return without_outer(covered, s, closest_points(s.x, other).beyond, part)
 
 
 def _integrals_of(side: FaceTriangles) -> Vector:
