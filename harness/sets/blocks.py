@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import csc_array
 
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.sets.convex import Vector
@@ -93,7 +93,7 @@ class Blocks(ABC):
         """
 
     @abstractmethod
-    def normals(self, x: Vector) -> tuple[coo_array, Vector]:
+    def normals(self, x: Vector) -> tuple[csc_array, Vector]:
         """Return outward unit normals (n, j) at x (n,), and the slack (j,) of each.
 
         Nonnegative combinations of the normals with zero slack span the normal cones,

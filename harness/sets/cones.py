@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import csc_array
 
 from mortarbench.harness.sets.blocks import Blocks, norms
 from mortarbench.harness.sets.convex import Limits, Vector
@@ -125,18 +125,22 @@ class Cones(Blocks):
         off_polar = norms((z - self.admissible(z))[self.index])
         return np.where(is_apex, off_polar, rest)
 
-    def normals(self, x: Vector) -> tuple[coo_array, Vector]:
+    def normals(
+        self, x: Vector, force: Vector | None = None
+    ) -> tuple[csc_array, Vector]:
         """Return outward normals (n, j) at x (n,), and their slacks (j,).
 
         They are the directions (−μ, t)/√(1 + μ²), where t is x_T/‖x_T‖ or one of the
-        `_DIRECTIONS`. All of them are normal at the apex. The slack is that of a plane
-        that touches the cone, (μx_N − tᵀx_T)/√(1 + μ²).
+        `_DIRECTIONS`; if a force (n,) is given, t is its direction instead. All of them
+        are normal at the apex. The slack is that of a plane that touches the cone,
+        (μx_N − tᵀx_T)/√(1 + μ²).
         """
         k, d = self.index.shape
-        tangents = x[self.index[:, 1:]]
+        tangents = (x if force is None else force)[self.index[:, 1:]]
         sizes = norms(tangents)[:, None]
         along = tangents / np.where(sizes > 0, sizes, 1)
         fixed = _DIRECTIONS if d == 3 else np.vstack([np.eye(d - 1), -np.eye(d - 1)])
+        fixed = fixed if force is None else fixed[:0]
         t = np.stack([along, *np.broadcast_to(fixed[:, None], (len(fixed), k, d - 1))])
         mu = np.broadcast_to(self.slope[None, :, None], (len(t), k, 1))
         outward = np.concatenate([-mu, t], axis=2) / np.hypot(1, mu)
@@ -144,7 +148,7 @@ class Cones(Blocks):
         outward[..., 0] = np.where(mu[..., 0] == 0, -1, outward[..., 0])
         index = np.broadcast_to(self.index, outward.shape)
         column = np.repeat(np.arange(len(t) * k), d)
-        normals = coo_array(
+        normals = csc_array(
             (outward.ravel(), (index.ravel(), column)), shape=(x.size, len(t) * k)
         )
         return normals, -(normals.T @ x)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import csc_array
 
 from mortarbench.harness.sets.blocks import Blocks, norms
 from mortarbench.harness.sets.convex import Limits, Vector
@@ -100,12 +100,12 @@ class Discs(Blocks):
         rest = norms(force - (along * is_active)[:, None] * outward)
         return np.where(self.radius > 0, rest, 0 * rest)
 
-    def normals(self, x: Vector) -> tuple[coo_array, Vector]:
+    def normals(self, x: Vector) -> tuple[csc_array, Vector]:
         """Return outward normals (n, k) at x (n,), and the slacks r − ‖x_I‖ (k,)."""
         sizes, (k, d) = self._norms(x), self.index.shape
         outward = x[self.index] / np.where(sizes > 0, sizes, 1)[:, None]
         places = self.index.ravel(), np.repeat(np.arange(k), d)
-        normals = coo_array((outward.ravel(), places), shape=(x.size, k))
+        normals = csc_array((outward.ravel(), places), shape=(x.size, k))
         return normals, self.radius - sizes
 
     def substituted(self, T: Any, a: Vector) -> Self:

@@ -2,8 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import diags_array, random_array
 
-from mortarbench.harness import QP, InputError
+from mortarbench.harness import QP, Cones, InputError
+from mortarbench.harness.conformance.manufactured import (
+    SET_SHAPES,
+    manufactured_over_sets,
+)
 from mortarbench.harness.verify import multipliers
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.multipliers import with_multipliers
@@ -169,3 +174,107 @@ def test_too_many_multipliers_are_refused(monkeypatch):
         InputError, match=r"too many to compute; expected y, z and z_box"
     ):
         with_multipliers(qp, np.zeros(4))
+
+
+INTEGERS = QP.from_arrays(
+    P=[[4, 6, -4], [6, 9, -6], [-4, -6, 4]], q=[52, 45, -34],
+    A=[[-2, 1, 0], [1, -1, -2]], b=[4, 0], G=[[-2, 2, -1]], h=[0],
+    lb=[-np.inf, -4, 0], ub=[-4, -4, np.inf],
+)  # fmt: skip
+CROSSING = QP.from_arrays(
+    np.zeros((2, 2)), [-1, -2], A=[[1, 1], [1, -1]], b=[2, 0], lb=[1, 1], ub=[1, 1]
+)
+
+
+@pytest.mark.parametrize(("qp", "x"), [(INTEGERS, [-4, -4, 0]), (CROSSING, [1, 1])])
+def test_more_active_constraints_than_variables_have_moderate_multipliers(qp, x):
+    """Least squares without a rank threshold return multipliers of 5e16."""
+    s = with_multipliers(qp, np.array(x, dtype=float))
+
+    assert kkt_residuals(qp, s).worst <= 1e-14
+    assert max(np.abs(v).max(initial=0) for v in (s.y, s.z, s.z_box)) <= 100
+
+
+@pytest.mark.parametrize("count", SEARCHED)
+def test_integer_vertices_with_dependent_rows_are_proven(count):
+    """P, rows, x and multipliers are integers, so that the KKT conditions are exact."""
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        n, m, p = int(rng.integers(1, 7)), *(int(k) for k in rng.integers(1, 7, 2))
+        M, A, G = (rng.integers(-2, 3, (k, n)) for k in (rng.integers(1, 3), m, p))
+        A[-1], G[-1] = 2 * A[0], A[0]  # dependent rows
+        x = rng.integers(-4, 5, n)
+        y, z = rng.integers(-5, 6, m), rng.integers(0, 6, p)
+        z_box = rng.integers(-5, 6, n)
+        lb, ub = np.where(z_box < 0, x, x - 1), np.where(z_box > 0, x, x + 1)
+        q = -(M.T @ (M @ x) + A.T @ y + G.T @ z + z_box)
+        qp = QP.from_arrays(M.T @ M, q, G, G @ x, A, A @ x, lb, ub)
+        s = with_multipliers(qp, x.astype(float))
+        assert kkt_residuals(qp, s).worst <= 1e-12, seed
+        largest = max(np.abs(v).max(initial=0) for v in (s.y, s.z, s.z_box))
+        assert largest <= 1e4, seed
+
+
+@pytest.mark.parametrize("shape", SET_SHAPES)
+def test_solutions_over_discs_and_cones_are_proven(shape):
+    for seed in range(5):
+        qp, planted = manufactured_over_sets(shape, seed=seed)
+        assert kkt_residuals(qp, with_multipliers(qp, planted.x)).worst <= 1e-9
+
+
+def qp_at_apexes(seed, rows, along):
+    """Return a QP over cones, most of them at their apex, and its solution.
+
+    along : True for forces on the boundary of the polar cone, False for its interior
+    """
+    rng = np.random.default_rng(seed)
+    k = int(rng.integers(1, 6))
+    index, slope = rng.permutation(3 * k).reshape(k, 3), rng.uniform(0.2, 1, k)
+    t = rng.standard_normal((k, 2))
+    t /= np.linalg.norm(t, axis=1)[:, None]
+    x, z, pull = np.zeros(3 * k), np.zeros(3 * k), rng.uniform(0.5, 2, k)[:, None]
+    slips = rng.integers(0, 3, k) == 0
+    x[index] = np.column_stack([np.ones(k), slope[:, None] * t]) * slips[:, None]
+    depth = slope * np.where(slips | along, 1, 2)
+    z[index] = np.column_stack([-depth, t]) * pull
+    W, A = rng.standard_normal((3 * k, 3 * k)), rng.standard_normal((rows, 3 * k))
+    P = W @ W.T / x.size + 0.1 * np.eye(x.size)
+    q = -(P @ x + A.T @ rng.standard_normal(rows) + z)
+    stated = dict(A=A, b=A @ x) if rows else {}
+    return QP.from_arrays(P, q, sets=[Cones(index, slope)], **stated), x
+
+
+@pytest.mark.parametrize("count", [5, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("along", [False, True])
+@pytest.mark.parametrize("rows", [0, 2])
+def test_forces_at_the_apex_of_cones_are_found(rows, along, count):
+    """Forces on the boundary of the polar cone have one direction of friction.
+
+    Together with rows, the directions of some cones converge slowly.
+    """
+    worst = [
+        kkt_residuals(qp, with_multipliers(qp, x)).worst
+        for qp, x in (qp_at_apexes(seed, rows, along) for seed in range(count))
+    ]
+
+    assert np.quantile(worst, 0.9) <= (1e-9 if rows and along else 1e-12)
+    assert np.mean(np.array(worst) <= 10 * TOL) >= 0.95
+
+
+@pytest.mark.slow
+def test_thousands_of_active_rows_and_bounds_have_multipliers():
+    """1500 of 3000 bounds, 500 equality rows and 1000 inequality rows are active."""
+    rng, n = np.random.default_rng(0), 3000
+    P = diags_array([np.full(n, 2.0), -np.ones(n - 1), -np.ones(n - 1)],
+                    offsets=[0, 1, -1]).tocsc()  # fmt: skip
+    A, G = (
+        random_array((k, n), density=4 / n, rng=rng, data_sampler=rng.standard_normal)
+        for k in (500, 1000)
+    )
+    x = rng.standard_normal(n)
+    lb = np.where(rng.random(n) < 0.5, x, -np.inf)
+    z_box = np.where(np.isfinite(lb), -rng.exponential(size=n), 0)
+    rows = A.T @ rng.standard_normal(500) + G.T @ rng.exponential(size=1000)
+    qp = QP.from_arrays(P, -(P @ x + rows + z_box), G, G @ x, A, A @ x, lb=lb)
+
+    assert kkt_residuals(qp, with_multipliers(qp, x)).worst <= 1e-12
