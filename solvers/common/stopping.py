@@ -14,8 +14,8 @@ Xⱼ = max(‖√D x‖∞, tol·F)/√Dⱼ, a point solves a QP to the toleranc
 The terms tol·F and tol·F² replace an absolute tolerance: if the solution is x = 0, the
 other scales vanish, and a residual r of size tol·F√D moves x by tol·F/√D. If Px and q
 are rounding errors, F is ‖√D x‖∞. Rounding errors of r and of the gap are subtracted,
-but at most `tol` times the scale. Multipliers with a wrong sign count as zero. `solvers.smalbe.compiled` contains the same test for
-bounds and equality rows.
+but at most `tol` times the scale. Multipliers with a wrong sign count as zero. The file
+solvers/smalbe/stopping.pxi contains the same test for bounds and equality rows.
 """
 
 from __future__ import annotations
