@@ -69,7 +69,8 @@ CG_SHARE = 0.01
 #: share of the distance to the boundary s = 0 or z = 0 that a step may cover
 TO_BOUNDARY = 0.995
 #: The method ends after this number of consecutive iterations, none of which halved the
-#: smallest residual so far: rounding and inexact solves then prevent further progress.
+#: smallest residual or the smallest sᵀz so far; rounding or inexact solves then prevent
+#: progress.
 PATIENCE = 10
 
 
@@ -205,13 +206,15 @@ def _iterate(
     problem: Problem, tol: float, max_iter: int, counts: Counter[str]
 ) -> Solution:
     at = _start(problem, tol, counts)
-    best, best_worst, stalled = problem.solution(at), np.inf, 0
+    best, best_worst, least, stalled = problem.solution(at), np.inf, np.inf, 0
     for k in range(max_iter + 1):
         solution = replace(problem.solution(at), iterations=k, message="converged")
         worst = relative_residual(problem.qp, solution, tol)
         if worst <= tol:
             return solution
-        stalled = 0 if worst < best_worst / 2 else stalled + 1
+        total = at.s @ at.z
+        stalled = 0 if worst < best_worst / 2 or total < least / 2 else stalled + 1
+        least = min(least, total)
         if worst < best_worst:
             best, best_worst = solution, worst
         if stalled >= PATIENCE:

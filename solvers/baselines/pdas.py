@@ -154,18 +154,20 @@ class PDAS:
         self, qp: QP, tol: float, carry: Carry | None
     ) -> Callable[[], tuple[Solution, Carry | None]]:
         message = "P is not positive semidefinite"
-        indefinite = Solution.without_point(qp, Status.FAILED, message)
+        if not abs(qp.P).sum():  # a linear program
+            message = "rounding errors in the factor of a face"
+        broken = Solution.without_point(qp, Status.FAILED, message)
         try:
             counts = Counter[str]()
             problem = penalise(qp, counts, self.faces(qp, tol, counts))
         except NOT_POSITIVE:
-            return lambda: (indefinite, None)
+            return lambda: (broken, None)
 
         def run() -> tuple[Solution, Carry | None]:
             try:
                 return _proximal(problem, tol, _start(qp, carry), self.max_iter)
             except NOT_POSITIVE:
-                return indefinite, None
+                return broken, None
             except InnerSolveError as e:
                 return Solution.without_point(qp, Status.FAILED, f"{e}"), None
 

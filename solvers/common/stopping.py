@@ -13,10 +13,9 @@ Xⱼ = max(‖√D x‖∞, tol·F)/√Dⱼ, a point solves a QP to the toleranc
 
 The terms tol·F and tol·F² replace an absolute tolerance: if the solution is x = 0, the
 other scales vanish, and a residual r of size tol·F√D moves x by tol·F/√D. If Px and q
-are rounding errors, F is ‖√D x‖∞. From r and from the gap, their rounding errors are
-subtracted, but at most `tol` times the scale. Multipliers with a wrong sign count as
-zero. `solvers.smalbe.compiled` contains the same test for
-bounds and equality rows.
+are rounding errors, F is ‖√D x‖∞. Rounding errors of r and of the gap are subtracted,
+but at most `tol` times the scale. Multipliers with a wrong sign count as zero. The file
+solvers/smalbe/stopping.pxi contains the same test for bounds and equality rows.
 """
 
 from __future__ import annotations
@@ -57,13 +56,13 @@ def relative_residual(qp: QP, s: Solution, tol: float) -> float:
     tol : the tolerance, on which the scales depend if x is nearly zero
     """
     x, y, z, z_box = s.x, s.y, np.maximum(s.z, 0), admissible(qp.sets, s.z_box)
-    Px, root, curved = qp.P @ x, np.sqrt(curvatures(qp)), np.sqrt(_diagonal(qp))
-    force, size = max(_sup(Px / root), _sup(qp.q / root)), _sup(curved * x)
-    eps = ROUNDING * np.finfo(x.dtype).eps
+    Px, root, eps = qp.P @ x, np.sqrt(curvatures(qp)), ROUNDING * np.finfo(x.dtype).eps
+    force, size = max(_sup(Px / root), _sup(qp.q / root)), _sup(root * x)
     if force <= eps * size:
         force = size
-    least = tol * force if curved.any() else 0.0
-    X = max(_sup(root * x), least) / root
+    force = force or 1.0  # only rows and multipliers have a scale
+    least = tol * force if _diagonal(qp).any() else 0.0
+    X = max(size, least) / root
     r, errors = Px + qp.q + z_box, []
     if y.size:
         r = r + qp.A.T @ y
@@ -72,11 +71,12 @@ def relative_residual(qp: QP, s: Solution, tol: float) -> float:
         r = r + qp.G.T @ z
         errors.append(_ratio(_over(qp.h - qp.G @ x), abs(qp.h) + abs(qp.G) @ X))
     for limit in (limit for one in qp.sets for limit in one.limits(x)):
-        size = limit.size + np.maximum(limit.terms, X[limit.variable])
-        errors.append(_ratio(_over(limit.slack), size))
+        terms = np.maximum(limit.terms, X[limit.variable])
+        errors.append(_ratio(_over(limit.slack), limit.size + terms))
     energies, work = np.array([x @ Px, qp.q @ x]), qp.b @ y + qp.h @ z
     gap = energies.sum() + work + sum(one.support(z_box) for one in qp.sets)
-    energy, terms = max(_sup(energies), least * force), curved * x @ (curved * x)
+    energy = max(_sup(energies), least * force) or force * size
+    terms = (root * x) @ (root * x)
     for error, scale, rounding in (
         (_sup(r / root), force, eps * size),
         (gap, energy, eps * terms),

@@ -152,8 +152,8 @@ cdef extern from "vectors.h" nogil:
                  const double *g, double *z, Py_ssize_t n)
     void masked(const double *free, const double *a, double *t, Py_ssize_t n)
     void terms_of_test(const double *x, const double *Px, const double *q,
-                       const double *r, const double *d, const double *w,
-                       Py_ssize_t n, double *sums, double *most)
+                       const double *r, const double *w, Py_ssize_t n, double *sums,
+                       double *most)
 
 cdef extern from "incomplete.h" nogil:
     int RUN

@@ -57,7 +57,7 @@ cdef class SMALBE(MPRGP):
     cdef Model cached_model
     cdef double cached_rho
     cdef double M_now, tol, energy, small_gradient, coarse_gradient
-    # (4n,) workspace of the test of KKT residuals; None for the test of ‖g^P‖
+    # (3n,) D⁻¹ᐟ² and workspace of the test of KKT residuals; None to test ‖g^P‖
     cdef Room tested
     cdef double next_tested  # ‖g^P‖ at or below which KKT residuals are evaluated next
     # number of products up to which the energy error is reduced
@@ -98,10 +98,10 @@ cdef class SMALBE(MPRGP):
         self.preconditioned = preconditioned
         self.factor, self.tail = problem.factor, 1.0
         if problem.tests_residuals:
-            self.tested = Room(4 * self.n)
+            self.tested = Room(3 * self.n)
             memcpy(self.tested.at, self.diagonal, self.n * sizeof(double))
             scale(self.inverse_norm, self.tested.at, self.n)
-            scales(self.tested.at, self.tested.at + self.n, self.n, self.over)
+            scales(self.tested.at, self.n, self.over)
         kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
         if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
@@ -413,14 +413,14 @@ cdef class SMALBE(MPRGP):
         and the gap is xᵀg^P.
         """
         cdef Py_ssize_t i, n = self.n
-        cdef double *d = self.tested.at
-        cdef double *r = d + 2 * n
+        cdef double *w = self.tested.at
+        cdef double *r = w + n
         cdef double *Hx = r + n
         cdef double[3] sums
-        cdef double[4] most
+        cdef double[3] most
         cdef double gap = 0.0
         sums[:] = [0.0, 0.0, 0.0]
-        most[:] = [0.0, 0.0, 0.0, 0.0]
+        most[:] = [0.0, 0.0, 0.0]
         for i in range(n):
             Hx[i] = self.g[i] + self.b[i]
             r[i] = self.g[i]
@@ -429,7 +429,7 @@ cdef class SMALBE(MPRGP):
             if self.x[i] >= self.set.upper[i] and r[i] < 0:
                 r[i] = 0.0
             gap += self.x[i] * r[i]
-        terms_of_test(self.x, Hx, self.b, r, d, d + n, n, sums, most)
+        terms_of_test(self.x, Hx, self.b, r, w, n, sums, most)
         return worst_ratio(sums, most, gap, self.tol)
 
     cdef bint is_accurate(self) except -1:

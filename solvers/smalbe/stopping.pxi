@@ -14,20 +14,24 @@ cdef double worst_ratio(
 ) noexcept:
     """Return the larger of the relative errors of stationarity and of the gap.
 
-    sums, most : results of `terms_of_test`. On return, most[1] is the scale F of forces
-        and most[3] is the least size of scaled variables.
+    sums, most : results of `terms_of_test`; on return, most[2] is the size of all
+        scaled variables
     """
-    cdef double rounding = 8 * 2.0 ** -52, dual, energy
-    if most[1] <= rounding * most[2]:
-        most[1] = most[2]
-    most[3] = fmax(most[3], tol * most[1])
-    energy = fmax(fmax(fabs(sums[0]), fabs(sums[1])), tol * most[1] * most[1])
-    dual = ratio(most[0], most[1], fmin(rounding * most[2], tol * most[1]))
-    return fmax(dual, ratio(gap, energy, fmin(rounding * sums[2], tol * energy)))
+    cdef double rounding = 8 * 2.0 ** -52, size = most[2], force = most[1], energy
+    if force <= rounding * size:
+        force = size
+    force = force if force else 1.0
+    energy = fmax(fmax(fabs(sums[0]), fabs(sums[1])), tol * force * force)
+    energy = energy if energy else force * size
+    most[2] = fmax(size, tol * force)
+    return fmax(
+        ratio(most[0], force, fmin(rounding * size, tol * force)),
+        ratio(gap, energy, fmin(rounding * sums[2], tol * energy)),
+    )
 
 
-cdef bint scales(const double *d, double *w, Py_ssize_t n, Reduction over) except -1:
-    """w ← D⁻¹ᐟ² with D from `solvers.common.stopping`; return True unless d = 0."""
+cdef bint scales(double *d, Py_ssize_t n, Reduction over) except -1:
+    """d ← D⁻¹ᐟ² with D from the diagonal d of P; return False if d was zero."""
     cdef Py_ssize_t i
     cdef double usual
     cdef double[2] total
@@ -38,7 +42,7 @@ cdef bint scales(const double *d, double *w, Py_ssize_t n, Reduction over) excep
     over.add(total, 2)
     usual = total[0] / total[1] if total[1] > 0 else 1.0
     for i in range(n):
-        w[i] = 1 / sqrt(d[i] if d[i] > 1e-12 * usual else usual)
+        d[i] = 1 / sqrt(d[i] if d[i] > 1e-12 * usual else usual)
     return total[1] > 0
 
 
@@ -55,11 +59,10 @@ def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
     cdef int k
     cdef list owners = []
     cdef double[4] sums
-    cdef double[4] most
+    cdef double[3] most
     cdef double worst
-    cdef Room room = Room(3 * n + 2 * m)
-    cdef double *d = room.at
-    cdef double *w = d + n
+    cdef Room room = Room(2 * n + 2 * m)
+    cdef double *w = room.at
     cdef double *r = w + n
     cdef double *missed = r + n
     cdef double *size = missed + m
@@ -74,8 +77,9 @@ def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
     cdef const double *row
     cdef CompressedRows by_components  # Gᵀ
     if len(diagonal):
-        memcpy(d, read(diagonal, owners), n * sizeof(double))
-    tol = tol if scales(d, w, n, over) else 0.0
+        memcpy(w, read(diagonal, owners), n * sizeof(double))
+    if not scales(w, n, over):
+        tol = 0.0
     # 1. Gᵀy, Gx and Σ|Gᵢⱼ|wⱼ
     if isinstance(G, np.ndarray):
         row = read(G, owners)
@@ -99,19 +103,19 @@ def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
         copy_result(G.T @ s.y, n, r, "Gᵀy")
     # 2. Stationarity and the gap
     sums[:] = [0.0, 0.0, 0.0, 0.0]
-    most[:] = [0.0, 0.0, 0.0, 0.0]
+    most[:] = [0.0, 0.0, 0.0]
     for i in range(n):
         r[i] += Fx[i] + q[i] + z[i]
         if z[i] != 0:
             sums[3] += (ub[i] if z[i] > 0 else lb[i]) * z[i]
-    terms_of_test(x, Fx, q, r, d, w, n, sums, most)
+    terms_of_test(x, Fx, q, r, w, n, sums, most)
     over.add(sums, 4)
-    for i in range(4):
+    for i in range(3):
         most[i] = -over.least(-most[i])
     for i in range(m):
         sums[3] += e[i] * y[i]
     worst = worst_ratio(sums, most, sums[0] + sums[1] + sums[3], tol)
     # 3. The rows
     for i in range(m):
-        worst = fmax(worst, ratio(missed[i] - e[i], fabs(e[i]) + most[3] * size[i]))
+        worst = fmax(worst, ratio(missed[i] - e[i], fabs(e[i]) + most[2] * size[i]))
     return worst

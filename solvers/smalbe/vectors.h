@@ -1037,26 +1037,23 @@ TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, d
 }
 
 /* Add terms of the stopping test (`solvers/common/stopping.py`) at a point with the
-   residual r, where d is the diagonal of P and w = D⁻¹ᐟ²: xᵀPx, qᵀx and Σ d xᵢ² to
-   `sums`; `most` becomes at least as large as the components of w|r|, w max(|Px|, |q|),
-   dw|x| and |x|/w. */
+   residual r, where w = D⁻¹ᐟ²: xᵀPx, qᵀx and Σ(xᵢ/wᵢ)² to `sums`; `most` becomes at least
+   as large as the components of w|r|, w max(|Px|, |q|) and |x|/w. */
 TWICE static void
-terms_of_test(in x, in Px, in q, in r, in d, in w, Py_ssize_t n, out sums, out most)
+terms_of_test(in x, in Px, in q, in r, in w, Py_ssize_t n, out sums, out most)
 {
-    double xPx = 0, qx = 0, terms = 0;
-    double error = most[0], force = most[1], curved = most[2], size = most[3];
+    double xPx = 0, qx = 0, square = 0;
+    double error = most[0], force = most[1], size = most[2];
     for (Py_ssize_t i = 0; i < n; i++) {
-        double residual = w[i] * fabs(r[i]), length = fabs(x[i]);
+        double residual = w[i] * fabs(r[i]), length = fabs(x[i]) / w[i];
         double larger = w[i] * LARGER(fabs(Px[i]), fabs(q[i]));
-        double change = d[i] * w[i] * length, scaled = length / w[i];
         xPx += x[i] * Px[i];
         qx += q[i] * x[i];
-        terms += d[i] * length * length;
+        square += length * length;
         error = LARGER(residual, error);
         force = LARGER(larger, force);
-        curved = LARGER(change, curved);
-        size = LARGER(scaled, size);
+        size = LARGER(length, size);
     }
-    sums[0] += xPx, sums[1] += qx, sums[2] += terms;
-    most[0] = error, most[1] = force, most[2] = curved, most[3] = size;
+    sums[0] += xPx, sums[1] += qx, sums[2] += square;
+    most[0] = error, most[1] = force, most[2] = size;
 }

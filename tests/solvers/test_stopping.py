@@ -115,6 +115,21 @@ def test_forces_that_vanish_are_relative_to_their_rounding_errors():
     assert residual(qp, at(x + 1e-9 * B[:, 0])) > 0.1
 
 
+def test_without_an_objective_only_rows_have_a_scale():
+    """P = 0 and q = 0: every feasible point is a solution, with multipliers of zero."""
+    qp = free(2, A=[[1, 1]], b=[4])
+    assert residual(qp, at([1, 3], [0])) == 0
+    assert residual(qp, at([1, 3], [1e-9])) <= 1e-9
+    assert residual(qp, at([1, 3], [1])) > 0.1
+
+
+def test_energy_that_vanishes_beside_other_variables():
+    """½s² with s − x/2 = −3 and x ≥ 0: s = 0, x = 6; s is found up to rounding."""
+    qp = QP.from_arrays(np.diag([1, 0]), [0, 0], A=[[1, -0.5]], b=[-3])
+    assert residual(qp, at([1e-22, 6], [-1e-22])) <= 1e-9
+    assert residual(qp, at([1e-3, 6.002], [0])) > 0.1
+
+
 @pytest.mark.parametrize(("size", "expected"), [(1e-13, 1e-7), (1e-11, 1e-5)])
 def test_a_solution_of_zero_is_reached_up_to_the_error_of_admissible_forces(
     size, expected
@@ -133,7 +148,8 @@ def test_rounding_of_a_linear_program_has_no_curvature():
     """min 1e-9 x with x ≥ 1e9: r is 10 % of q, whatever the unit of x."""
     qp = QP.from_arrays([[0]], [1e-9], lb=1e9)
     assert residual(qp, at([1e9], z_box=[-1e-9])) == 0
-    assert residual(qp, at([1e9], z_box=[-0.9e-9])) == pytest.approx(0.1)
+    short = at([1e9], z_box=[-0.9e-9])
+    assert residual(qp, short) == pytest.approx(0.1, rel=1e-5)
 
 
 def test_an_operator_without_a_diagonal_has_one_unit_for_all_variables():

@@ -234,6 +234,35 @@ def test_an_indefinite_P_is_a_failure():
     assert "not positive semidefinite" in s.message
 
 
+@pytest.mark.parametrize("store", [np.asarray, csr_array])
+@pytest.mark.parametrize("repeats", [1, 20_000])
+def test_a_linear_program_is_not_called_indefinite(store, repeats):
+    """max x₁ + x₂ with x₁ + x₂ ≤ 1, x ≥ 0. Repeated rows add up their penalties."""
+    qp = QP.from_arrays(
+        store(np.zeros((2, 2))), [-1, -1], G=store(np.ones((repeats, 2))),
+        h=np.ones(repeats), lb=0,
+    )  # fmt: skip
+    s = solve(qp)
+
+    assert "semidefinite" not in s.message
+    assert s.status is Status.FAILED or qp.objective(s.x) == pytest.approx(-1)
+    assert repeats > 1 or s.status is Status.SOLVED
+
+
+def test_without_an_objective_a_feasible_point_is_found():
+    rng = np.random.default_rng(0)
+    A = rng.standard_normal((2, 3))
+    qp = QP.from_arrays(
+        np.zeros((3, 3)), np.zeros(3), A=A, b=A @ rng.random(3), lb=0, ub=1
+    )
+    s = solve(qp)
+
+    assert s.status is Status.SOLVED
+    assert A @ s.x == pytest.approx(qp.b)
+    assert (s.x >= 0).all()
+    assert (s.x <= 1).all()
+
+
 def test_a_certificate_must_hold():
     qp = quadratic(np.eye(2), [0.0, 0], A=[[1, 1]], b=[-1.0], lb=0.0)
     feasible = replace(qp, b=np.array([1.0]))
