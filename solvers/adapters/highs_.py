@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any, ClassVar
 
 import numpy as np
@@ -86,7 +87,7 @@ class HiGHS:
             "residual of 1 (HiGHS 1.15.1); the conformance check 'finds where a "
             "membrane of 400 nodes touches' tests for this error.",
             "Without highspy-extras, HiGHS silently runs qpasm instead of hipo; the "
-            "adapter therefore raises ImportError, and the QP is declined.",
+            "adapter therefore declines.",
             "qpasm stores a dense Hessian on the null space of the active rows. A QP "
             "is declined if a dense Hessian of all variables would not fit into "
             "memory.",
@@ -98,13 +99,17 @@ class HiGHS:
         check_choice("method", self.method, ("qpasm", "hipo"))
 
     def declines(self, qp: QP) -> str | None:
-        return needs_dense(qp, 1) if self.method == "qpasm" else needs_matrices(qp)
+        if self.method == "qpasm":
+            return needs_dense(qp, 1)
+        if find_spec("highspy_extras") is None:  # HiGHS would run qpasm instead
+            return "not installed: highspy_extras (pip install highspy-extras)"
+        return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import highspy
 
         if self.method == "hipo":
-            import highspy_extras  # noqa: F401  # without it HiGHS runs qpasm instead
+            import highspy_extras  # noqa: F401  # HiGHS finds hipo after this import
 
         scale = objective_factor(qp, 1.0)
         solver = highspy.Highs()

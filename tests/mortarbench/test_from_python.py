@@ -17,7 +17,7 @@ from mortarbench.harness import plugin
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
-from tests.support.active_row import QP, ActiveRow
+from tests.support.active_row import QP, ActiveRow, Hangs
 
 pytestmark = pytest.mark.together
 
@@ -314,6 +314,27 @@ def test_verify_agrees_with_solve(form):
     assert mb.verify(case, 0.999 * s.x).verdict is not mb.Verdict.VERIFIED
 
 
+def test_a_solve_ends_at_its_time_limit():
+    answer = mb.solve(QP, Hangs(), time_limit=0.5)
+
+    assert answer.verdict is mb.Verdict.TIME_LIMIT
+    assert answer.record.message == "killed after 0.5 s"
+
+
+def test_a_check_ends_at_its_time_limit_and_the_next_one_is_run():
+    checks = ["gives multipliers our signs", "refuses a misspelt option"]
+    named = []
+    result = mb.test_solver(
+        Hangs(), checks=checks, time_limit=0.5, progress=named.append
+    )
+
+    assert {n: r.grade.value for n, r in result.results.items()} == {
+        checks[0]: "fail", checks[1]: "pass",
+    }  # fmt: skip
+    assert result.failed == {checks[0]: "killed after 0.5 s"}
+    assert named == [f"Hangs: check {i} of 2, {checks[i - 1]}" for i in (1, 2)]
+
+
 # Exports.
 
 
@@ -578,6 +599,14 @@ def test_the_public_names_suffice_for_plug_ins(tmp_path):
         (lambda: mb.replay("nowhere", "abc"), "nowhere"),
         (lambda: mb.replay(None, "abc"), "folder = None; expected a path"),
         (lambda: mb.replay("nowhere", 5), "run_id = 5; expected a nonempty string"),
+        (
+            lambda: mb.solve(QP, "clarabel", time_limit=0),
+            "time_limit = 0; expected a positive number",
+        ),
+        (
+            lambda: mb.test_solver("clarabel", time_limit="1"),
+            "time_limit = '1'; expected a positive number",
+        ),
         (lambda: mb.test_solver(5), "solver = 5; expected the name of a solver"),
         (lambda: mb.test_solver("clarable"), "did you mean 'clarabel'"),
     ],

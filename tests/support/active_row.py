@@ -3,6 +3,7 @@
 Workers import the module of a solver object; this one loads faster than a test module.
 """
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,3 +31,14 @@ class ActiveRow:
             status=mb.Status.SOLVED, x=x, y=none, z=z, z_box=np.zeros(2)
         )
         return lambda: solution
+
+
+@dataclass(frozen=True)
+class Hangs(ActiveRow):
+    """Solver that hangs except in the warm-up, whose QPs have 32 unknowns."""
+
+    def declines(self, qp):
+        return "the warm-up" if qp.q.size == 32 else None
+
+    def prepare(self, qp, tol):
+        time.sleep(3600)
