@@ -155,7 +155,9 @@ class ContactSide:
 
     name: str  #: name of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) numbers of the nodes along the side
-    length: Vector  #: (s,) length of the undeformed side attributed to each node, m
+    #: (s,) length of the undeformed side attributed to each node, m, or area, m²; only
+    #: parts that the master covers, and 0 at nodes without a pressure of their own
+    length: Vector
     #: (s, dim) force of this contact on each slave node: N/m in 2D, N in 3D
     force: NDArray[Any]
     pressure: Vector  #: (s,) contact pressure in Pa, positive in compression

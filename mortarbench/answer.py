@@ -344,7 +344,7 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
                 "a single node is in contact, so the computed pressure depends on the "
                 "mesh width and grows on finer meshes; refine the mesh near the contact"
             )
-        if record.quantities.get("undetermined"):
+        if record.quantities.get("undetermined_friction"):
             reasons.append(
                 "friction forces are not unique: where supports or other contact rows "
                 "prevent slip, other friction forces have the same displacements, so "

@@ -64,12 +64,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.rows import ContactRows, without_outer
-from mortarbench.problems.contact.segment_search import (
-    Reach,
-    closest_points,
-    facing_segments,
-)
+from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.contact.segment_search import Reach, facing_segments
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
@@ -162,7 +158,7 @@ def mortar(
     j = np.flatnonzero(integrals.cover)
     B = _rows(integrals, j, (slave, master), points.shape)
     T = _rotated(B if tangential else B[:0])
-    rows = ContactRows(
+    return ContactRows(
         B,
         integrals.gap[j] / integrals.cover[j] + B @ u,
         T,
@@ -172,7 +168,6 @@ def mortar(
         integrals.covered[j] / s.areas[j],
         np.arange(j.size),
     )
-    return without_outer(rows, s, closest_points(s.x, m).beyond, part)
 
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:

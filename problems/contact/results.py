@@ -131,7 +131,7 @@ def friction_quantities(
     """Return counts of friction states, the residual of Coulomb's law and dissipation.
 
     `open`, `stick` and `slip` are the numbers of frictional contact rows that are
-    inactive, active and sticking, and active and slipping, see `states`. `undetermined`
+    inactive, active and sticking, and active and slipping, see `states`. `undetermined_friction`
     is the number of dependent rows among those that stick, and is omitted if it is 0;
     friction forces are otherwise not unique, see `undetermined_friction`.
     `sliding_without_contact` is the number of inactive rows with shear, which Tresca's
@@ -146,7 +146,7 @@ def friction_quantities(
     shear_alone = float(shear[without_contact].sum() / (shear.sum() or 1.0))
     undetermined = undetermined_friction(primal, s, friction)
     return {
-        **({"undetermined": undetermined} if undetermined else {}),
+        **({"undetermined_friction": undetermined} if undetermined else {}),
         **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},
         "sliding_without_contact": int(without_contact.sum()),
         "shear_without_contact": shear_alone,

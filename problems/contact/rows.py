@@ -18,12 +18,12 @@ moment. Two rules keep the forces in equilibrium:
 
       Σ_e ∫_e N_j g  ≥  0,   where  ∫_e N_j g ≈ g_j ∫_e N_j  on all other facets.
 
-A node beyond the border of which the master covers less than `BARELY` times the area
-that it covers of a neighbour has no row, because small forces would cause large
-pressures there. At a straight border, this applies to nodes that are more than half a
-facet beyond. In the integrals, N_j is added to the functions of the nodes with a row in
-its facets, so that the functions of all rows sum to one, and the areas of all rows to
-the covered area.
+A node of which the master covers less than `MIN_COVER` times the area that it covers of
+a neighbour has no row, because its row would hardly differ from that of the neighbour.
+At a straight border, this applies to nodes more than nine tenths of a facet beyond. In
+the integrals, N_j is added to the functions of the nodes with a row in its facets, so
+that the functions of all rows sum to one, and the areas of all rows to the covered
+area.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from mortarbench.problems.fem.mesh import Nodes, dofs_of
 #: a nodal row, relative to the smaller radius of a facet of both sides: a tenth of the
 #: length of a segment, the default of Abaqus
 EXTENSION = 0.2
-#: smallest ratio of the covered areas of neighbouring slave nodes with rows, if one of
-#: them is beyond the border of the master. On a uniform chain, the ratio is (θ²/2) /
-#: (1/2 + θ − θ²/2) if the fraction θ of the last segment is covered, and 1/7 for θ = ½
-BARELY = 1 / 7
+#: smallest ratio of the covered areas of neighbouring slave nodes with integral rows.
+#: On a uniform chain, the ratio is (θ²/2) / (1/2 + θ − θ²/2) if the fraction θ of the
+#: last segment is covered: 1/100 for θ = 0.1
+MIN_COVER = 1 / 100
 #: two rows of a slave node are the same if their entries differ by at most this value,
 #: and their gaps by at most this fraction of the size of the bodies
 SAME_ROW = 1e-9
@@ -190,15 +190,13 @@ def _with_integrals(
     """
     s, areas = nodal.c.size, side.areas
     cut = np.asarray(outside[side.facets].any(axis=1))
-    part, whole = integral(part=cut), areas.copy()
+    whole = areas.copy()
     bordered = np.unique(side.facets[cut])
     whole[bordered] = side.areas_in(~cut)[bordered]
     whole[outside] = 0.0
+    part = without_barely_covered(integral(part=cut), side.facets[cut], areas, whole)
     covered = np.zeros((2, s))  # ∫N_j on the cut facets, as in `share` and in `covered`
     covered[:, part.place] = part.share, part.covered * areas[part.place]
-    # a node whose facets are covered only at an angle beyond that of the integrals
-    alone = ~outside & (whole + covered[0] == 0)
-    whole[alone] = areas[alone]
     # the rows are V · nodal + W · part, with weights that sum to one
     kept = whole + covered[0] > 0
     total = np.where(kept, whole + covered[0], 1.0)
@@ -220,41 +218,26 @@ def _with_integrals(
     ).selected(kept)
 
 
-def without_outer(
-    rows: ContactRows,
-    side: Surface,
-    beyond: Vector,
-    part: NDArray[np.bool_] | None = None,
+def without_barely_covered(
+    rows: ContactRows, facets: Nodes, areas: Vector, elsewhere: Vector
 ) -> ContactRows:
-    """Add the functions N_j of nodes that the master barely covers to those of others.
+    """Add the functions N_j of nodes that the master barely covers to their neighbours.
 
     Parameters
     ----------
-    rows : one mortar row for each covered node
-    side : slave side at X + u^k
-    beyond : (s,) distances of the nodes beyond the border, see `Feet`
-    part : mask (f,) of the facets of `rows`; the master covers all others
+    rows : integral rows, one for each covered node
+    facets : (f, a) facets of the slave side, as indices into its s nodes
+    areas, elsewhere : (s,) areas of the nodes, and the covered part of these areas that
+        is not in `rows`
 
     """
-    s, place, facets, areas = beyond.size, rows.place, side.facets, side.areas
-    covered, most = np.zeros(s), np.zeros(s)
+    place, covered = rows.place, np.zeros(areas.size)
     covered[place] = rows.covered * areas[place]
-    area = covered if part is None else covered + side.areas_in(~part)
-    np.maximum.at(most, facets, area[facets].max(axis=1, keepdims=True))
-    kept = (covered > 0) & ((beyond == 0) | (area >= BARELY * most))
-    if kept[place].all():
-        return rows
-    # E (s, s) divides the function of a node among the nodes with a row in its facets
-    i = np.repeat(facets, facets.shape[1], axis=1).ravel()
-    j = np.tile(facets, (1, facets.shape[1])).ravel()
-    given = kept[i] & ~kept[j]
-    E = csr_array((np.ones(given.sum()), (i[given], j[given])), shape=(s, s))
-    E.data[:] = 1.0
-    E.data /= np.bincount(E.indices, minlength=s)[E.indices]
-    E = csr_array(E + diags_array(kept.astype(float)))[kept][:, place]
+    kept = (covered > 0) & ~barely_covered(covered + elsewhere, facets, MIN_COVER)
+    E = handed_over(facets, kept)[kept][:, place]
     share = E @ rows.share
     W = csr_array(diags_array(1 / share) @ E @ diags_array(rows.share))
-    per_row, every = rows.T.shape[0] // place.size, np.arange(share.size)
+    per_row, every = rows.T.shape[0] // max(place.size, 1), np.arange(share.size)
     return ContactRows(
         B=csr_array(W @ rows.B),
         c=W @ rows.c,
@@ -265,6 +248,42 @@ def without_outer(
         covered=E @ covered[place] / areas[kept],
         at=every,
     )
+
+
+def barely_covered(covered: Vector, facets: Nodes, ratio: float) -> NDArray[np.bool_]:
+    """Return the mask (s,) of nodes with a small covered area beside a larger one.
+
+    Parameters
+    ----------
+    covered : (s,) covered area of each node
+    facets : (f, a) facets of the side
+    ratio : smallest ratio of the areas of neighbours that does not count as small
+
+    """
+    most = np.zeros(covered.size)
+    np.maximum.at(most, facets, covered[facets].max(axis=1, keepdims=True))
+    return np.asarray(covered < ratio * most)
+
+
+def handed_over(facets: Nodes, kept: NDArray[np.bool_]) -> csr_array:
+    """Return E (s, s), which adds values of nodes to those of kept nodes.
+
+    The value of a node that is not kept is divided equally among the kept nodes in its
+    facets; values of kept nodes do not change.
+
+    Parameters
+    ----------
+    facets : (f, a) facets of the side
+    kept : (s,) mask of the nodes
+
+    """
+    i = np.repeat(facets, facets.shape[1], axis=1).ravel()
+    j = np.tile(facets, (1, facets.shape[1])).ravel()
+    given, shape = kept[i] & ~kept[j], (kept.size, kept.size)
+    E = csr_array((np.ones(given.sum()), (i[given], j[given])), shape=shape)
+    E.data[:] = 1.0
+    E.data /= np.bincount(E.indices, minlength=kept.size)[E.indices]
+    return csr_array(E + diags_array(kept.astype(float)))
 
 
 def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:

@@ -16,7 +16,11 @@ from mortarbench.problems.contact.bodies import (
     ContactSides,
     UnassembledBodies,
 )
-from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.contact.rows import (
+    ContactRows,
+    barely_covered,
+    handed_over,
+)
 from mortarbench.problems.contact.surface import current_surface
 from mortarbench.problems.fem.mesh import as_vectors
 
@@ -27,6 +31,11 @@ NO_SLIP = 1e-12
 #: pivots of the Gram matrix of unit rows up to this value belong to dependent rows; the
 #: matrix is regularised by the square of this value
 DEPENDENT = 1e-8
+#: ratio of the covered areas of neighbouring slave nodes below which a node has no
+#: pressure, and its force and area are added to those of its neighbours: small forces
+#: would otherwise be large pressures. At a straight border, this applies to nodes more
+#: than half a facet beyond, see `problems.contact.rows.MIN_COVER`
+BARELY = 1 / 7
 _STATE = f"U{len(SLIDING)}"  #: dtype of arrays of states; SLIDING is the longest name
 
 
@@ -76,8 +85,8 @@ def contact_sides(
         zip(pair_names(bodies), bodies.pairs, strict=True)
     ):
         slave, here = slaves[k], slice(first[k], first[k + 1])
-        # fraction (m,) of each row's force that belongs to this pair
         mine = owner[rows.place] == k
+        # fraction (m,) of each row's force that belongs to this pair
         own = rows.of_rows(rows.share * mine) / rows.of_rows(rows.share)
         # 0.0 − x instead of −x avoids negative zeros in reports
         force = as_vectors(0.0 - B.T @ (normal * own), dim)[slave]
@@ -86,23 +95,30 @@ def contact_sides(
         shearing = np.zeros_like(force)
         if acts:
             shearing -= as_vectors(friction.T.T @ (tangential * slipping), dim)[slave]
-        area = current_surface(points, 0 * u, pair.slave, "slave").areas * covered[here]
+        side = current_surface(points, 0 * u, pair.slave, "slave")
         outward = current_surface(points, u, pair.slave, "slave").node_normal
-        along, place = rows.resultants(slave, dim)[rows.at[mine]], rows.place[mine]
-        pressing = np.zeros(slave.size)
-        pressing[place - first[k]] = push[place] * np.einsum(
-            "ex,ex->e", along, outward[place - first[k]]
+        at, along = rows.place[mine] - first[k], rows.resultants(slave, dim)
+        against = np.zeros(slave.size)  # n · (force on the slave) per unit multiplier
+        against[at] = np.einsum("ex,ex->e", along[rows.at[mine]], outward[at])
+        # barely covered nodes hand their area and forces over to their neighbours
+        area = np.zeros(slave.size)
+        area[at] = (side.areas * covered[here])[at]
+        kept = (area > 0) & ~barely_covered(area, side.facets, BARELY)
+        E = handed_over(side.facets, kept)
+        area, pressing, shear_force, pushing = (
+            E @ v for v in (area, push[here] * against, shear[here], push[here])
         )
+        per_area = np.divide(1.0, area, out=np.zeros_like(area), where=kept)
         sides.append(
             ContactSide(
                 name=name,
                 nodes=slave,
                 length=area,
                 force=force + shearing,
-                pressure=pressing / area,
+                pressure=pressing * per_area,
                 gap=gap[here],
-                push=push[here],
-                shear=shear[here] / area if acts else None,
+                push=pushing,
+                shear=shear_force * per_area if acts else None,
                 friction=nodal_state[here] if acts else None,
                 friction_force=shearing if acts else None,
             )

@@ -48,13 +48,9 @@ from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.mortar import Basis
-from mortarbench.problems.contact.rows import ContactRows, without_outer
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.contact.segment_search import Reach
-from mortarbench.problems.contact.space.triangles import (
-    FaceTriangles,
-    closest_points,
-    triangulated,
-)
+from mortarbench.problems.contact.space.triangles import FaceTriangles, triangulated
 from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
@@ -165,7 +161,7 @@ def face_mortar(
         # both tangents of a row in succession
         order = np.arange(2 * active.size).reshape(2, -1).T.ravel()
         T = csr_array(vstack(stacked).tocsr()[order])
-    covered = ContactRows(
+    return ContactRows(
         B,
         gap[active] / cover[active] + B @ u,
         T,
@@ -175,7 +171,6 @@ def face_mortar(
         (cover / _integrals_of(own))[active],
         np.arange(active.size),
     )
-    return without_outer(covered, s, closest_points(s.x, other).beyond, part)
 
 
 def _integrals_of(side: FaceTriangles) -> Vector:
