@@ -51,7 +51,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
         new.unlink(missing_ok=True)
 
 
-def replace_file(path: Path, content: bytes | memoryview) -> None:
+def replace_file(path: Path, content: bytes) -> None:
     """Write `content` to a file with `replacing`; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:

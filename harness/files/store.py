@@ -273,7 +273,9 @@ def save(folder: Path, arrays: Arrays) -> str:
     archive = BytesIO()
     np.savez(archive, **arrays)  # type: ignore[arg-type]
     # flushed to the disk before the journal line that refers to the file is written
-    replace_file(path, archive.getbuffer())
+    # not `getbuffer`: if the write fails, Python 3.13 may report that the archive was
+    # collected while this view of it existed
+    replace_file(path, archive.getvalue())
     return digest
 
 

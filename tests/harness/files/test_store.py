@@ -1,5 +1,7 @@
 import os
 import shutil
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -43,6 +45,35 @@ def test_a_point_comes_back_bit_for_bit(tmp_path, solution):
     assert loaded.status is Status.ITERATION_LIMIT
     for name in ("x", "y", "z", "z_box"):
         assert getattr(loaded, name).tobytes() == getattr(solution, name).tobytes()
+
+
+def test_no_view_of_an_archive_outlives_a_failed_write(tmp_path):
+    """If a garbage collector finds an archive and its view in one cycle, Python 3.13
+    reports a BufferError, in whatever code runs at this time; earlier versions report
+    it in development mode only.
+    """
+    program = """
+import gc, sys
+from pathlib import Path
+import numpy as np
+from mortarbench.harness.files import store
+errors = []
+def fail(*_):
+    raise OSError(28, "No space left on device")
+store.replace_file = fail
+try:
+    store.save(Path(sys.argv[1]), {"x": np.ones(3)})
+except OSError as e:
+    errors += [e, errors]
+del errors
+gc.collect()
+"""
+    done = subprocess.run(
+        [sys.executable, "-X", "dev", "-c", program, tmp_path],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+
+    assert done.stderr == ""
 
 
 def test_equal_points_are_one_file_whenever_they_are_stored(tmp_path, solution):
