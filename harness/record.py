@@ -25,14 +25,13 @@ SCHEMA = 3
 #: An answer counts as verified if its residuals are at most this multiple of the
 #: tolerance.
 VERIFIED_FACTOR = 10.0
-READABLE = (3,)  #: versions that `Record.from_json` accepts
 TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
 LARGEST_INTEGER = 2**63 - 1  #: largest integer that 64-bit formats (Parquet) can store
 #: smallest and largest valid measured time in s; 0 is also valid
 SECONDS = (1e-12, 1e10)
 MAX_LEVELS = 20  #: largest depth of nested lists and tables in a field
 
-_WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
+_WRONG_SCHEMA = f"not a journal line of schema {SCHEMA}"
 _TOO_LARGE = "expected an integer of at most 64 bits"
 #: fields whose values are equal in many lines; equal values are stored only once in
 #: memory
@@ -258,23 +257,9 @@ class Record(Measurement):
     def to_json(self) -> str:
         """Return one line of strict JSON.
 
-        NaN, inf and integers beyond 64 bits become null. Fields that do not occur in
-        old journals are omitted if they have their default values, so that the line of
-        an old record does not change.
+        NaN, inf and integers beyond 64 bits become null.
         """
-        row = finite(self.to_dict())
-        if not self.session:
-            del row["session"]
-        if self.step_tol is None:
-            del row["step_tol"]
-        if self.ranks == 1:
-            del row["ranks"]
-        if self.build_peak_mib is None:
-            del row["build_peak_mib"]
-        for name in ("rank_seconds", "rank_counts", "rank_network"):
-            if not row[name]:
-                del row[name]
-        return json.dumps(row, allow_nan=False)
+        return json.dumps(finite(self.to_dict()), allow_nan=False)
 
     @staticmethod
     def from_json(line: str | bytes, shared: dict[Any, Any] | None = None) -> Record:
@@ -407,7 +392,7 @@ def _explained(e: Exception, row: object) -> str:
 
     e : error of msgspec, which contains the path of the field
     """
-    if not isinstance(row, dict) or row.get("schema") not in READABLE:
+    if not isinstance(row, dict) or row.get("schema") != SCHEMA:
         return _WRONG_SCHEMA
     place = re.search(r"at `\$\.(\w+)", str(e))
     if place is None:
@@ -428,7 +413,7 @@ def _check(r: Record) -> None:
         If a value is out of range; the message states field, value and range.
 
     """
-    if r.schema not in READABLE:
+    if r.schema != SCHEMA:
         raise ValueError(_WRONG_SCHEMA)
     if not r.run_id:
         raise ValueError("run_id is empty; expected a nonempty string")

@@ -231,13 +231,6 @@ def _numbers(c: Replay) -> Iterable[list[str]]:
         )
         if (a, b) != (None, None):
             yield [name, _text(a), _text(b), _same(a == b)]
-    if c.then.schema != c.now.schema:
-        yield [
-            "residuals",
-            f"schema {c.then.schema}",
-            f"schema {c.now.schema}",
-            "defined differently",
-        ]
     for name in (*_RESIDUALS, "objective"):
         a, b = getattr(c.then, name), getattr(c.now, name)
         if (a, b) != (None, None):

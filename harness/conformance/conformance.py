@@ -156,7 +156,8 @@ def _judge(qp: QP, s: Solution, allowed: float) -> None:
 
 def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None:
     qp, expected = manufactured(shape, dense=dense)
-    s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
+    # judged at 1e-8: a bound may be far smaller than the norms in a solver's own test
+    s = _solved(solver, qp, 1e-9, 10 * VERIFIED_FACTOR)
     objective = qp.objective(expected.x)
     _near("objective", qp.objective(s.x), objective, 1e-6 * abs(objective))
     if shape != "singular":

@@ -25,7 +25,7 @@ NAMED = 8  #: largest number of changes named in the text; the tables list all
 WORDS = ("slower", "faster", "no change seen", "not resolved")
 
 
-_CONDITIONS = ("same_folder", "conditions", "residuals", "busy")
+_CONDITIONS = ("same_folder", "conditions", "busy")
 
 
 def verdict_lines(c: Comparison) -> list[str]:
@@ -66,7 +66,6 @@ def sentences(c: Comparison) -> tuple[str, ...]:
 def _named_sentences(c: Comparison) -> dict[str, str]:
     """Return all sentences by name; a sentence that does not apply is empty."""
     keys = [key for key, *_ in environments(c.before, c.after)]
-    schemas = [sorted({r.schema for r in e.records}) for e in (c.before, c.after)]
     loads = [
         f"{load:.2f} {when}"
         for when, e in (("before", c.before), ("after", c.after))
@@ -77,11 +76,9 @@ def _named_sentences(c: Comparison) -> dict[str, str]:
     apart = None in relative or any(map(side, relative))
     alike = everything is not None and side(everything) and not apart
     same = c.before.directory.resolve() == c.after.directory.resolve()
-    equal = schemas[0] == schemas[1] and len(schemas[0]) == 1
     return {
         "same_folder": TEXT("same_folder") if same else "",
         "conditions": TEXT("conditions", c, keys, machines_differ(c.before, c.after)),
-        "residuals": "" if equal else TEXT("residuals", *schemas),
         "busy": TEXT("busy", loads) if loads else "",
         "times": TEXT("times", [change_word(p.ratio) for p in c.timed if p.ratio]),
         "slower": TEXT("slower", regressions(c)),

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 from mortarbench.harness import InputError, Verdict
-from mortarbench.harness.record import PROVEN, SCHEMA, VERIFIED_FACTOR
+from mortarbench.harness.record import PROVEN, VERIFIED_FACTOR
 from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import differences, environment_of
 from mortarbench.reports.data.environment import QUIET_LOAD, busy_with, machine
@@ -31,7 +31,6 @@ TEXT = Sentences(
     ENDINGS=ENDINGS,
     FACTOR=VERIFIED_FACTOR,
     QUIET_LOAD=QUIET_LOAD,
-    SCHEMA=SCHEMA,
 )
 
 
@@ -50,7 +49,6 @@ def summary(a: Analysis) -> Iterator[Part]:
         others=_others(evidence),
         faults=in_words(evidence.faults),
         judged=sorted({r.accuracy for r in evidence.records if r.accuracy is not None}),
-        schemas=sorted({r.schema for r in evidence.records} - {SCHEMA}),
         load=busy_with(evidence),
         repeats=sorted({len(o.records) for o in tried}),
     )

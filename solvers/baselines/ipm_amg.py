@@ -212,7 +212,7 @@ def _iterate(
         worst = relative_residual(problem.qp, solution, tol)
         if worst <= tol:
             return solution
-        total = at.s @ at.z
+        total = float(at.s @ at.z)
         stalled = 0 if worst < best_worst / 2 or total < least / 2 else stalled + 1
         least = min(least, total)
         if worst < best_worst:

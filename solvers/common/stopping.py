@@ -6,7 +6,8 @@ With the scale of forces F = max(‖Px/√D‖∞, ‖q/√D‖∞) and the size
 Xⱼ = max(‖√D x‖∞, tol·F)/√Dⱼ, a point solves a QP to the tolerance `tol` if
 
 * |aᵢx − bᵢ| ≤ tol·(|bᵢ| + Σ|aᵢⱼ|Xⱼ) for each equality row; likewise the violation of
-  each inequality row, bound, disc and cone
+  each inequality row and bound, and of each disc and cone, relative to its limit and
+  the larger of its terms and X
 * ‖r/√D‖∞ ≤ tol·F with r = Px + q + Aᵀy + Gᵀz + z_box
 * |xᵀPx + qᵀx + bᵀy + hᵀz + σ(z_box)| ≤ tol·max(|xᵀPx|, |qᵀx|, tol·F²), where σ is the
   support function of the sets, for bounds the product of bounds and multipliers

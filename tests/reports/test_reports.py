@@ -106,37 +106,6 @@ def test_an_unverified_answer_is_never_the_fastest(measured, evidence):
     assert row["liar"].value is None  # without a value, it is not sorted with times
 
 
-def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evidence):
-    """At tol 1e-8, residuals up to 1e-7 verify an answer unless an optimum decides."""
-    optimum = {"decided_by": "reference", "optimum_error": 2e-8}
-    off = {"decided_by": "reference", "optimum_error": 1.0, "verdict": Verdict.WRONG}
-    records = [
-        measured("residuals"),
-        measured("agreed", **optimum),
-        measured("optimum", dual=3e-7, **optimum),
-        measured("refuted", **off),
-        measured("both", dual=3e-1, **off),
-    ]
-    page = compose(evidence(records))
-    legend = "⋆: the proven optimum of a small QP overrules the residuals."
-    texts = {
-        "residuals": "verified", "agreed": "verified", "optimum": "verified ⋆",
-        "refuted": "wrong ⋆", "both": "wrong",
-    }  # fmt: skip
-
-    (row,) = table(page, "verdicts")
-    assert {solver: row[solver].text for solver in texts} == texts
-    errors = {r["solver"].text: r["verdict"].text for r in table(page, "errors")}
-    assert errors == texts
-    text = markdown(page)
-    assert text.count(legend) == 3  # verdicts, refuted claims, errors
-    assert text.count("(⋆ in tables)") == 1  # in the caption of the figure of accuracy
-    assert "or, for small QPs, on a proven optimum" in text
-
-    page = compose(evidence(records[:2]))
-    assert "⋆" not in markdown(page)
-
-
 def test_one_unverified_repeat_voids_the_time(measured, evidence):
     records = timed(measured, "a", [0.01, 0.01, 0.01])
     records[1] = records[1].replace(verdict=Verdict.INACCURATE)

@@ -72,8 +72,8 @@ def free(n, **constraints):
         (free(2, G=[[3, 0]], h=[4]), [1, 2], 0),
         (free(2, lb=[1, 0]), [0.5, 4], 0.5 / (1 + 4)),
         (free(2, ub=[1, 0]), [-4, 1], 1 / 4),
-        (free(2, sets=[Discs([[0, 1]], [1])]), [0, 2], 1 / (1 + np.hypot(2, 2))),
-        (free(2, sets=[Cones([[0, 1]], [0.5])]), [1, 2], 1.5 / 3),
+        (free(2, sets=[Discs([[0, 1]], [1])]), [0, 2], 1 / (1 + 2)),
+        (free(2, sets=[Cones([[0, 1]], [0.5])]), [1, 2], 1.5 / (0.5 + 2)),
         (free(1, A=[[0]], b=[1]), [0], 1),
         # the distant limit of one row is not a scale of another
         (free(2, G=np.eye(2), h=[1e20, 1]), [1, 1.01], 0.01 / 2.01),

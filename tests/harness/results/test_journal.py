@@ -2,17 +2,11 @@ import json
 import os
 import resource
 import shutil
-from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from mortarbench.harness import InputError, Record, Verdict
-from mortarbench.harness.names import assemble
-from mortarbench.harness.plugin import as_family
-from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.results.journal import Journal, read_journal
-from mortarbench.harness.verify.verdicts import new_record
 
 
 def record(run_id, **changes):
@@ -137,44 +131,6 @@ def test_a_field_of_the_wrong_type_is_named_with_its_line(
     with pytest.raises(InputError) as e:
         read_journal(tmp_path)
     assert str(e.value) == (f"{file}, line 2: {field} = {value!r}; expected {expected}")
-
-
-def test_a_line_of_the_first_schema_is_read_with_its_meaning(tmp_path):
-    """Residuals of schema 1 have other scales; residuals and verdict are unchanged."""
-    row = json.loads(record("a", claimed="solved", primal=2e-8).to_json())
-    for name in ("decided_by", "optimum_error"):
-        del row[name]
-    file = tmp_path / "journal" / "here.jsonl"
-    file.parent.mkdir()
-    lines = [row | {"schema": 1}, row | {"run_id": "b"}]
-    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
-
-    old, new = read_journal(tmp_path)
-
-    assert (old.schema, new.schema) == (1, 2)
-    assert (old.primal, old.verdict) == (new.primal, new.verdict)
-    assert json.loads(old.to_json())["schema"] == 1
-
-
-def test_the_run_id_of_a_measurement_is_that_of_older_folders():
-    """With another run_id, a continued run would repeat all measurements."""
-    box = SimpleNamespace(name="box", defaults={"n": 1}, forms=("dual",))
-    made = new_record(
-        assemble(as_family(box), {"n": 3}, "dual"),
-        SolverSpec(name="osqp", label="osqp"), options={"max_iter": 100}, tol=1e-6,
-        repeat=2, environment="e",
-    )  # fmt: skip
-
-    assert made.run_id == "37b0acf5a279"
-
-
-def test_old_lines_are_written_as_they_were_read():
-    """Names, order and values of the fields are identical."""
-    (old,) = (Path(__file__).parents[2] / "data/results-2026-11/journal").iterdir()
-    lines = old.read_text().splitlines()
-
-    assert len(lines) >= 20
-    assert [Record.from_json(line).to_json() for line in lines] == lines
 
 
 def test_a_folder_without_journal_is_named(tmp_path):

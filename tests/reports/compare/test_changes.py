@@ -82,17 +82,6 @@ def only(c):
 # definitions
 
 
-def test_different_definitions_of_residuals_are_reported(changed):
-    old = [replace(r, schema=1) for r in suite(1, cases=1)]
-    said = "The definition of the residuals differs: journal schema 1 before, 2 after."
-
-    for c in (changed(old, suite(2, cases=1)),):
-        assert any(line.startswith(said) for line in verdict_lines(c))
-        assert said in " ".join(compose(c).sections[0].prose)
-    for same in (changed(old, old), changed(suite(1, cases=1), suite(2, cases=1))):
-        assert not any("definition of the" in line for line in verdict_lines(same))
-
-
 # times
 
 

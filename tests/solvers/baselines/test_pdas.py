@@ -223,7 +223,7 @@ def test_an_unbounded_objective_is_reported(store):
     qp = quadratic([[1, 0], [0, 0]], [1.0, -1], lb=[0, 0], store=store)
     s = solve(qp)
 
-    assert s.status is Status.INFEASIBLE
+    assert s.status is Status.UNBOUNDED
     assert "unbounded below" in s.message
 
 

@@ -134,5 +134,5 @@ def test_operators_are_accepted_and_rows_are_declined(manufactured):
 def test_an_unbounded_objective_is_reported():
     s = solve(boxed([[1, 0], [0, 0]], [1.0, -1], lb=0.0))
 
-    assert s.status is Status.INFEASIBLE
+    assert s.status is Status.UNBOUNDED
     assert "unbounded below" in s.message
