@@ -107,14 +107,14 @@ class CachesInChains(CachesByContent):
 
 
 class CachesThePreparation(Sound):
-    """Solver whose preparation, which takes 0.2 s, is reused for an equal P."""
+    """Solver whose preparation, which takes 0.15 s, is reused for an equal P."""
 
     def prepare(self, qp, tol):
         known = MEMORIES.setdefault("preparation", set())
         if (key := qp.P.data.tobytes()) not in known:
-            time.sleep(0.2)
+            time.sleep(0.15)
             known.add(key)
-        return super().prepare(qp, tol)
+        return SOUND_SOLVERS["piqp-dense"].prepare(qp, tol)
 
 
 class Compiles(Sound):
