@@ -131,9 +131,9 @@ def friction_quantities(
     """Return counts of friction states, the residual of Coulomb's law and dissipation.
 
     `open`, `stick` and `slip` are the numbers of frictional contact rows that are
-    inactive, active and sticking, and active and slipping, see `states`. `undetermined_friction`
-    is the number of dependent rows among those that stick, and is omitted if it is 0;
-    friction forces are otherwise not unique, see `undetermined_friction`.
+    inactive, active and sticking, and active and slipping, see `states`.
+    `undetermined_friction` is the number of dependent rows among those that stick, and
+    is omitted if it is 0; friction forces are otherwise not unique.
     `sliding_without_contact` is the number of inactive rows with shear, which Tresca's
     law allows; these rows do not count as open. `shear_without_contact` is the fraction
     of Σ‖λ_t‖ that acts on these rows. `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for
