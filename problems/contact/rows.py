@@ -206,10 +206,14 @@ def _with_integrals(
     W = csr_array((weight, (part.place, np.arange(part.place.size))), shape=shape)
     one = eye_array(nodal.T.shape[0] // s)
     area = whole + covered[1]
+    B = csr_array(V @ nodal.B + W @ part.B)
+    T = csr_array(kron(V, one) @ nodal.T + kron(W, one) @ part.T)
+    for matrix in (B, T):
+        matrix.sort_indices()
     return ContactRows(
-        B=csr_array(V @ nodal.B + W @ part.B),
+        B=B,
         c=V @ nodal.c + W @ part.c,
-        T=csr_array(kron(V, one) @ nodal.T + kron(W, one) @ part.T),
+        T=T,
         row=nodal.row,
         share=area,
         place=nodal.place,

@@ -80,7 +80,7 @@ def test_fields_carry_the_stresses_of_the_dimensional_displacement():
         z_box=0 * u,
     )  # fmt: skip
 
-    nodal = fields(bodies, primal, s).nodal
+    nodal = fields(bodies, primal, s, rows).nodal
     expected = nodal_stresses(bodies, u)
     assert list(nodal) == ["sxx", "syy", "sxy", "szz", "von_mises"]
     for name, values in nodal.items():
