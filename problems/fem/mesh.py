@@ -26,7 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
-from mortarbench.harness.mechanics import CellBlock, boundary_facets, cell_blocks
+from mortarbench.harness.mechanics import (
+    CellBlock,
+    boundary_facets,
+    cell_blocks,
+    cell_facets,
+)
 from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, QUAD, Element
 
 Nodes = NDArray[np.int64]
@@ -456,6 +461,21 @@ def is_triangle(cells: Nodes) -> NDArray[np.bool_]:
     return np.asarray(cells[:, 2] == cells[:, 3])
 
 
+def adjacent_cells(cells: Nodes, dim: int) -> tuple[Nodes, Nodes, Nodes]:
+    """Return pairs of cells (k,) and (k,) with a common facet, and the facets (k, m).
+
+    Pairs are sorted by facet.
+
+    >>> adjacent_cells(rectangle((0, 0), (2, 1), (2, 1)).cells, 2)
+    (array([0]), array([1]), array([[1, 4]]))
+    """
+    facets, names, cell = cell_facets(cells, dim)
+    order = np.lexsort(names.T)
+    shared = np.flatnonzero((np.diff(names[order], axis=0) == 0).all(axis=1))
+    one, other = order[shared], order[shared + 1]
+    return cell[one], cell[other], facets[one]
+
+
 def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
     """Return ∫N_j ds (v,) of the linear shape functions on a polyline (v, dim), m.
 
@@ -467,6 +487,28 @@ def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
     return np.asarray(np.append(half, 0) + np.append(0, half))
 
 
+def facet_quadrature(
+    points: NDArray[np.float64], facets: Nodes
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return shape functions (q, m) and area vectors (q, k, dim) at Gauss points.
+
+    The area vector is the outward normal, multiplied by the weight of the point and by
+    the measure of the facet: a length in m in 2D, and an area in m² in 3D.
+
+    facets : (k, m) edges (m = 2) or faces (m = 4) of a boundary
+    """
+    if points.shape[1] == 2:
+        xi = np.array([-1.0, 1.0]) / np.sqrt(3)
+        x, y = np.diff(points[facets], axis=1)[:, 0].T
+        normals = np.stack([y, -x], axis=1) / 2
+        return np.stack([1 - xi, 1 + xi], axis=1) / 2, np.stack([normals] * 2)
+    areas = [
+        weight * np.cross(*np.einsum("ar,fax->rfx", QUAD.gradients(xi), points[facets]))
+        for xi, weight in zip(QUAD.points, QUAD.weights, strict=True)
+    ]
+    return np.stack([QUAD.shapes(xi) for xi in QUAD.points]), np.stack(areas)
+
+
 def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vector]:
     """Return the nodes of `faces` (k, 4), ascending, and their areas ∫N_j dA, m².
 
@@ -476,12 +518,11 @@ def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vecto
     ([4, 5, 6, 7], [0.25, 0.25, 0.25, 0.25])
     """
     nodes, place = np.unique(faces, return_inverse=True)
-    areas, place = np.zeros(nodes.size), place.reshape(faces.shape)
-    for xi, weight in zip(QUAD.points, QUAD.weights, strict=True):
-        tangents = np.einsum("ar,fax->rfx", QUAD.gradients(xi), points[faces])
-        measure = np.linalg.norm(np.cross(*tangents), axis=1)
-        np.add.at(areas, place, weight * measure[:, None] * QUAD.shapes(xi))
-    return nodes, areas
+    shapes, areas = facet_quadrature(points, faces)
+    shares = np.einsum("qm,qk->km", shapes, np.linalg.norm(areas, axis=2))
+    total = np.zeros(nodes.size)
+    np.add.at(total, place.reshape(faces.shape), shares)
+    return nodes, total
 
 
 def nodes_of_side(side: Nodes) -> Nodes:
