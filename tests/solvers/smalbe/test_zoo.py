@@ -20,15 +20,6 @@ from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.generated_bodies import generated_case
 
 PRESETS = ("smalbe-permon", "smalbe-espreso")
-NAMED = {
-    "string": [{"n": 100}, {"n": 1000}],
-    "journal-bearing": [
-        {"n": 50}, {"n": 100}, {"n": 50, "eccentricity": 0.9}
-    ],
-    "torsion": [{"n": 50}, {"n": 100}, {"n": 100, "twist": 20.0}],
-    "obstacle": [{"n": 64, "shape": "hemisphere"}, {"n": 128, "shape": "hemisphere"}],
-}  # fmt: skip
-CASES = [(family, given) for family, several in NAMED.items() for given in several]
 
 
 def products(name, qp, tol):
@@ -42,16 +33,6 @@ def products(name, qp, tol):
 def ratio(qp, tol):
     """Return the number of products of SMALBE divided by that of the better preset."""
     return products("smalbe", qp, tol) / min(products(p, qp, tol) for p in PRESETS)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("family", "given"), CASES, ids=str)
-def test_on_the_named_families_products_hardly_exceed_the_better_preset(family, given):
-    case = PROBLEMS[family].build(
-        "primal", PROBLEMS[family].complete(given), reference_solution
-    )
-
-    assert ratio(case.qp, 1e-6) <= 1.2
 
 
 @pytest.mark.slow
@@ -195,15 +176,3 @@ def test_a_poor_model_is_replaced():
 
     assert s.status is Status.SOLVED
     assert s.counts["P_products"] <= 200
-
-
-@pytest.mark.parametrize(
-    ("n", "most"),
-    [(1000, 3177), pytest.param(10_000, 41_801, marks=pytest.mark.slow)],
-)
-def test_a_long_string_takes_no_more_than_permon_itself(n, most):
-    """PERMON uses the better of standard and projected CG expansion for this length."""
-    family = PROBLEMS["string"]
-    case = family.build("primal", family.complete({"n": n}), reference_solution)
-
-    assert products("smalbe", case.qp, 1e-6) <= most
