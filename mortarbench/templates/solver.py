@@ -76,11 +76,15 @@ class Solver:
             )
 
         def solve() -> Solution:
-            for k, point in enumerate(iterates(P, qp.q, A, qp.b, C, d)):
-                if relative_residual(P, qp.q, A, qp.b, C, d, *point) <= tol:
-                    return answer(Status.SOLVED, *point, k)
-                if k == self.max_iter:
-                    break
+            try:
+                for k, point in enumerate(iterates(P, qp.q, A, qp.b, C, d)):
+                    if relative_residual(P, qp.q, A, qp.b, C, d, *point) <= tol:
+                        return answer(Status.SOLVED, *point, k)
+                    if k == self.max_iter:
+                        break
+            except (ArithmeticError, np.linalg.LinAlgError) as e:
+                message = f"the iterates diverge ({e}); the QP may have no solution"
+                return Solution.without_point(qp, Status.FAILED, message)
             return answer(Status.ITERATION_LIMIT, *point, k)
 
         return solve
