@@ -244,7 +244,7 @@ class Record(Measurement):
     @property
     def claims_answer(self) -> bool:
         """True if a solution is claimed, or if a certificate verifies another claim."""
-        return self.claimed == "solved" or self.verdict.is_verified
+        return self.claimed == "solved" or self.verdict in PROVEN
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with the fields in `changes` replaced."""

@@ -64,8 +64,8 @@ class Fclib(FromFile):
         from mortarbench.harness import Case
         from mortarbench.harness.checked import located
         from mortarbench.harness.errors import PastEndError
-        from mortarbench.problems.contact.friction_cones import coulomb_steps, states
         from mortarbench.problems.files.fclib import read_fclib
+        from mortarbench.problems.files.friction_cones import coulomb_steps, states
 
         p: Any = params
         path = self._located(params)

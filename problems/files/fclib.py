@@ -40,7 +40,7 @@ from mortarbench.harness.checked import located
 from mortarbench.harness.files.datafile import check_size, opened, parsing
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.sets.cones import Cones
-from mortarbench.problems.contact.friction_cones import FrictionalContact
+from mortarbench.problems.files.friction_cones import FrictionalContact
 
 SUFFIX = ".hdf5"
 _EXPECTED = "an FCLIB file (HDF5)"

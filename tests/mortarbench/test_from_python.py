@@ -280,7 +280,7 @@ def test_a_point_is_verified_with_and_without_its_multipliers():
     assert alone.multipliers.z == pytest.approx([0.5], abs=1e-15)
     assert found.residuals == (0, 0, 0, 0)
     assert found.objective == -0.625
-    assert repr(alone).startswith("<verified: error 0 relative to the proven optimum")
+    assert repr(alone).startswith("<verified: primal 0, dual ")
 
 
 def test_a_point_that_is_not_optimal_is_refuted():

@@ -14,13 +14,13 @@ import pytest
 import mortarbench as mb
 from mortarbench.harness import QP, InputError
 from mortarbench.harness.files.datafile import VARIABLE
-from mortarbench.problems.contact.friction_cones import FrictionalContact
 from mortarbench.problems.files.fclib import (
     read_datasets,
     read_fclib,
     to_contact,
     write_datasets,
 )
+from mortarbench.problems.files.friction_cones import FrictionalContact
 from tests.support.box_stack import (
     box_stack,
     global_arrays,
