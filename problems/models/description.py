@@ -208,7 +208,7 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     file = read_mesh_file(mesh_path)
     with located(str(path)):
         materials = _materials(table["bodies"], file)
-    named = named_mesh(file, materials)
+    named = named_mesh(file, {file.set_of(name) for name in materials})
     if named.dim == 3 and halvings:
         raise InputError(
             f"{mesh_path}: halvings={halvings} with volumes is not built; expected "
@@ -221,9 +221,7 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
     with located(str(path)):
-        for name in named.surfaces:
-            if name not in materials:
-                raise InputError(f"bodies: {named.words.body} {name!r} has no entry")
+        materials = {name: _material_of(materials, name, file) for name in named.surfaces}
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
         loads = _each(table, "loads", lambda entry: _load(entry, named))
         held = np.unique(np.concatenate(fixed))
@@ -290,7 +288,8 @@ def _materials(entries: object, file: FileMesh) -> dict[str, Material]:
 
     def read(entry: dict[str, Any]) -> None:
         _keys(entry, ("name", "E", "nu"))
-        name = _one_of(file.body_names, file.words.body, entry, "name")
+        name = checked.text("name", entry["name"])
+        _check_known(file.words.body, file.set_of(name), file.body_names)
         if name in materials:
             raise InputError(f"body {name!r} is described twice; expected once")
         E, nu = physical("E", checked.positive("E", entry["E"])), entry["nu"]
@@ -300,6 +299,16 @@ def _materials(entries: object, file: FileMesh) -> dict[str, Material]:
 
     _each({"bodies": entries}, "bodies", read)
     return materials
+
+
+def _material_of(
+    materials: Mapping[str, Material], body: str, file: FileMesh
+) -> Material:
+    """Return the material of a body, described by its name or that of its set."""
+    for name in (body, file.set_of(body)):
+        if name in materials:
+            return materials[name]
+    raise InputError(f"bodies: {file.words.body} {body!r} has no entry")
 
 
 def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:

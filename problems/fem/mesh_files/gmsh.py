@@ -1,19 +1,23 @@
-"""Reader of gmsh's .msh files with physical names."""
+"""Reader of gmsh's .msh files, formats 2 and 4.1, as text or binary data.
+
+In format 4.1, cells belong to entities of the drawing, and an entity may belong to
+several physical groups. In format 2, a cell has one physical group; gmsh repeats a cell
+for each further group.
+
+Reference: C. Geuzaine, J.-F. Remacle, Gmsh Reference Manual, MSH file formats.
+"""
 
 from __future__ import annotations
 
-import os
-from contextlib import redirect_stderr
-from io import StringIO
+from collections import defaultdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError
-from mortarbench.harness.files.datafile import check_size, opened, parsing
+from mortarbench.harness.files.datafile import content, parsing
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.fem.mesh_files.named import (
     DIMENSION,
@@ -21,7 +25,7 @@ from mortarbench.problems.fem.mesh_files.named import (
     Words,
 )
 
-#: memory required by meshio's parser, as a multiple of the size of the file
+#: memory required by the parser, as a multiple of the size of the file
 _PARSER_FACTOR = 32
 _LINEAR = "Mesh.ElementOrder = 1 in the .geo file, or gmsh -{} -order 1"
 _NAMING = 'Physical {}("NAME") in the .geo file'
@@ -42,45 +46,227 @@ _WORDS = {
     ),
 }
 _SAVED = "only physical groups: Mesh.SaveAll = 0"
+#: names and numbers of nodes of gmsh's element types
+_TYPES = {
+    1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4),
+    5: ("hexahedron", 8), 6: ("wedge", 6), 7: ("pyramid", 5), 8: ("line3", 3),
+    9: ("triangle6", 6), 10: ("quad9", 9), 11: ("tetra10", 10),
+    12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14),
+    15: ("vertex", 1), 16: ("quad8", 8), 17: ("hexahedron20", 20), 18: ("wedge15", 15),
+    19: ("pyramid13", 13),
+}  # fmt: skip
+#: types of numbers in binary files: integer, number of items, floating-point number
+_BYTES = {"i": "<i4", "n": "<u8", "d": "<f8"}
 
 
 def read_msh_sets(path: Path) -> FileMesh:
-    """Read the cells and physical groups of a .msh file, format 2.2 or 4.1.
+    """Read the cells and physical groups of a .msh file, format 2 or 4.1.
 
     Raises
     ------
     InputError
-        If the file cannot be read, contains node numbers below 1, or does not have a
-        tag for every cell.
+        If the file cannot be read, has a mesh in partitions, or contains cells with
+        nodes that are not in the file.
 
     """
-    mesh = _read(path)
-    blocks = [(block.type, np.asarray(block.data)) for block in mesh.cells]
-    tags = mesh.cell_data.get("gmsh:physical", [np.zeros(len(n)) for _, n in blocks])
-    cell_sets: dict[int, dict[str, list[Nodes]]] = {}
-    for k, ((kind, _), tag) in enumerate(zip(blocks, tags, strict=True)):
-        dim = DIMENSION.get(kind, -1)
-        names = {
-            int(number): name
-            for name, (number, dimension) in mesh.field_data.items()
-            if dimension == dim
-        }
-        for number in np.unique(tag):
-            if (name := names.get(int(number))) is not None:
-                rows = cell_sets.setdefault(dim, {}).setdefault(
-                    name, [np.zeros(0, dtype=np.int64) for _ in blocks]
-                )
-                rows[k] = np.flatnonzero(tag == number)
-    # in a file with named groups, cells with tag 0 show that the file was saved with
-    # Mesh.SaveAll = 1; without this option, gmsh omits entities without a physical
+    if path.suffix.lower() == ".geo":
+        raise InputError(
+            f"{path}: a drawing, not a mesh; generate a mesh first: "
+            f"gmsh -2 {path.name} writes {path.with_suffix('.msh').name}"
+        )
+    data = content(path, "a .msh file", copies=_PARSER_FACTOR)
+    room = _PARSER_FACTOR * len(data)
+    with parsing(path, "not a .msh file of format 2.2 or 4.1, or damaged", room):
+        version, is_binary, size = _section(data, "MeshFormat").split()[:3]
+        if version != b"4.1" and not version.startswith(b"2"):
+            raise InputError(
+                f"{path}: format {version[:9].decode(errors='replace')}; expected 2.2 "
+                "or 4.1: Mesh.MshFileVersion = 4.1 in the .geo file"
+            )
+        if b"$PartitionedEntities" in data:
+            raise InputError(f"{path}: a mesh in partitions; expected a whole mesh")
+        numbers = _Numbers(data, is_binary == b"1")
+        if numbers.is_binary and size != b"8":
+            raise InputError(f"{path}: numbers of {size!r} bytes; expected 8")
+        return _file_mesh(
+            path, data, *(_format_4 if version == b"4.1" else _format_2)(numbers)
+        )
+
+
+def _section(data: bytes, name: str) -> bytes:
+    """Return the content of a section; empty if the file has no such section."""
+    start = data.find(b"$" + name.encode())
+    end = data.find(b"$End" + name.encode(), start)
+    return data[data.index(b"\n", start) + 1 : end] if 0 <= start < end else b""
+
+
+class _Numbers:
+    """Numbers of a section, in the order of the file.
+
+    Raises
+    ------
+    ValueError
+        If the section ends before a number that is requested.
+
+    """
+
+    def __init__(self, data: bytes, is_binary: bool) -> None:
+        self.is_binary = is_binary
+        self._data, self._at = data, 0
+        self.values: Any = b""  #: bytes, or numbers of a text file
+
+    def open(self, name: str) -> bool:
+        """Go to the start of a section; return False if it is missing or empty."""
+        self._at, self.values = 0, _section(self._data, name)
+        if not self.is_binary:
+            words = self.values.split()
+            self.values = np.array(words).astype(float) if words else np.zeros(0)
+        return len(self.values) > 0
+
+    def count(self) -> int:
+        """Return the number of items of a section, which is text in format 2."""
+        if not self.is_binary:
+            return int(self.table(1, "i")[0])
+        self._at = self.values.index(b"\n") + 1
+        return int(self.values[: self._at])
+
+    def table(self, rows: Any, *columns: str) -> Any:
+        """Return the columns (rows, width) or (rows,) of a table of numbers.
+
+        columns : types ("i", "n", "d") of the numbers, with their width if not 1
+        """
+        types = [(c[0], int(c[1:] or 1)) for c in columns]
+        if self.is_binary:
+            fields = [(f"{k}", _BYTES[t], (w,)) for k, (t, w) in enumerate(types)]
+            items = np.frombuffer(self.values, fields, int(rows), self._at)
+            self._at += items.nbytes
+            parts = [items[name] for name, *_ in fields]
+        else:
+            width, rows = sum(w for _, w in types), int(rows)
+            items = self.values[self._at : self._at + rows * width]
+            self._at += rows * width
+            ends = np.cumsum([w for _, w in types])[:-1]
+            parts = np.split(items.reshape(rows, width), ends, axis=1)
+        tables = [
+            part if t == "d" else _integers(part)
+            for part, (t, _) in zip(parts, types, strict=True)
+        ]
+        flat = [t[:, 0] if t.shape[1] == 1 else t for t in tables]
+        return flat[0] if len(flat) == 1 else flat
+
+
+def _integers(values: NDArray[Any]) -> Nodes:
+    numbers = values.astype(np.int64)
+    if (numbers != values).any():
+        raise ValueError("not an integer")
+    return numbers
+
+
+#: numbers (N,) and points (N, 3) of nodes; for each block of cells, the name of their
+#: type, their nodes (k, corners), and the numbers of their physical groups
+_Content = tuple[Nodes, NDArray[np.float64], list[tuple[str, Nodes, list[int]]]]
+
+
+def _format_2(numbers: _Numbers) -> _Content:
+    """Read the nodes and cells of a file of format 2."""
+    numbers.open("Nodes")
+    node, points = numbers.table(numbers.count(), "i", "d3")
+    numbers.open("Elements")
+    left, cells = numbers.count(), defaultdict[tuple[str, int], list[Any]](list)
+    if not numbers.is_binary:
+        values, at = _integers(numbers.values).tolist(), 1
+        while at < len(values):
+            name, corners = _TYPES[values[at + 1]]
+            first = at + 3 + values[at + 2]
+            group = values[at + 3] if first > at + 3 else 0
+            cells[name, group].append(values[first : first + corners])
+            at, left = first + corners, left - 1
+        if left or at > len(values):
+            raise ValueError("a wrong number of cells")
+    while left > 0:
+        kind, count, tags = numbers.table(1, "i3")[0].tolist()
+        name, corners = _TYPES[kind]
+        table = numbers.table(count, f"i{1 + tags + corners}").reshape(count, -1)
+        groups = table[:, 1] if tags else np.zeros(count, dtype=np.int64)
+        for group in np.unique(groups).tolist():
+            cells[name, group].extend(table[groups == group, 1 + tags :].tolist())
+        left -= count
+    blocks = [
+        (name, np.array(of, dtype=np.int64), [group])
+        for (name, group), of in cells.items()
+    ]
+    return node, points, blocks
+
+
+def _format_4(numbers: _Numbers) -> _Content:
+    """Read the nodes, cells and entities of a file of format 4.1."""
+    groups: dict[tuple[int, int], list[int]] = {}
+    if numbers.open("Entities"):
+        for dim, count in enumerate(numbers.table(1, "n4")[0].tolist()):
+            for _ in range(count):
+                tag, _, physical = numbers.table(1, "i", "d6" if dim else "d3", "n")
+                groups[dim, int(tag[0])] = numbers.table(physical[0], "i").tolist()
+                if dim:  # the entities that bound it
+                    numbers.table(numbers.table(1, "n")[0], "i")
+    numbers.open("Nodes")
+    node, points = [], []
+    for _ in range(numbers.table(1, "n4")[0, 0]):
+        (dim, _, parametric), count = (v[0] for v in numbers.table(1, "i3", "n"))
+        node.append(numbers.table(count, "n"))
+        width = 3 + (dim if parametric else 0)
+        points.append(numbers.table(count, f"d{width}")[:, :3])
+    numbers.open("Elements")
+    blocks = []
+    for _ in range(numbers.table(1, "n4")[0, 0]):
+        (dim, tag, kind), count = (v[0] for v in numbers.table(1, "i3", "n"))
+        name, corners = _TYPES[int(kind)]
+        cells = numbers.table(count, f"n{1 + corners}")[:, 1:]
+        blocks.append((name, cells, groups.get((int(dim), int(tag)), [])))
+    return np.concatenate(node), np.concatenate(points), blocks
+
+
+def _file_mesh(
+    path: Path,
+    data: bytes,
+    node: Nodes,
+    points: NDArray[np.float64],
+    blocks: list[tuple[str, Nodes, list[int]]],
+) -> FileMesh:
+    """Name the sets of cells, and number the nodes from 0."""
+    names = {}
+    for line in _section(data, "PhysicalNames").splitlines()[1:]:
+        *tag, name = line.decode(errors="replace").split(maxsplit=2)
+        names[int(tag[0]), int(tag[1])] = name.strip().strip('"')
+    tables = defaultdict[str, list[Nodes]](list)
+    sets: Any = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    is_all = False
+    for kind, cells, groups in blocks:
+        dim, first = DIMENSION.get(kind, -1), sum(map(len, tables[kind]))
+        tables[kind].append(cells)
+        # a negative number denotes a group of reversed orientation
+        for number in {abs(number) for number in groups}:
+            if (dim, number) in names:
+                rows = first + np.arange(len(cells))
+                sets[dim][names[dim, number]][kind].append(rows)
+        is_all = is_all or not any(groups)
+    # in a file with named groups, cells without a group show that the file was saved
+    # with Mesh.SaveAll = 1; without this option, gmsh omits entities without a physical
     # group if any group exists
-    is_all = mesh.field_data and any((tag == 0).any() for tag in tags)
-    more = f"; or, if they belong to no body, save {_SAVED}" if is_all else ""
+    more = f"; or, if they belong to no body, save {_SAVED}" * (is_all and bool(names))
     return FileMesh(
         path=path,
-        points=np.asarray(mesh.points, dtype=float),
-        blocks=blocks,
-        cell_sets=cell_sets,
+        points=points,
+        cells={
+            kind: _positions(path, node, np.concatenate(parts))
+            for kind, parts in tables.items()
+        },
+        cell_sets={
+            dim: {
+                name: {kind: np.concatenate(rows) for kind, rows in of.items()}
+                for name, of in named.items()
+            }
+            for dim, named in sets.items()
+        },
         node_sets={},
         vocabulary={
             dim: words._replace(naming=words.naming + more)
@@ -89,83 +275,18 @@ def read_msh_sets(path: Path) -> FileMesh:
     )
 
 
-def _read(path: Path) -> Any:
-    if path.suffix.lower() == ".geo":
+def _positions(path: Path, node: Nodes, cells: Nodes) -> Nodes:
+    """Return the indices of node numbers (k, corners) in the list `node` (N,)."""
+    order = np.argsort(node, kind="stable")
+    if (twice := np.diff(node[order]) == 0).any():
         raise InputError(
-            f"{path}: a drawing, not a mesh; generate a mesh first: "
-            f"gmsh -2 {path.name} writes {path.with_suffix('.msh').name}"
+            f"{path}: node {node[order][1:][twice][0]} is defined twice; expected "
+            "every number once"
         )
-    with opened(path, "a .msh file") as file:
-        size = os.fstat(file.fileno()).st_size
-    check_size(f"{path}: its content", _PARSER_FACTOR * size)
-    with parsing(path, "not a .msh file of format 2.2 or 4.1", _PARSER_FACTOR * size):
-        with redirect_stderr(StringIO()):  # meshio warns about sections that it skips
-            mesh = _parse(path)
-        cells = [np.asarray(block.data) for block in mesh.cells]
-        tags = mesh.cell_data.get("gmsh:physical", [])
-        numbers = _numbers(path.read_bytes())
-        tagged = [len(tag) for tag in tags] == [len(nodes) for nodes in cells]
-    # node numbers start at 1; meshio would interpret −1 as an index from the end
-    if numbers is not None and (numbers < 1).any():
-        raise InputError(f"{path}: cells with node numbers below 1; expected 1 or more")
-    if tags and not tagged:
-        raise InputError(f"{path}: not every cell has a tag; expected a tag for each")
-    return mesh
-
-
-def _parse(path: Path) -> Any:
-    """Parse a file with meshio, admitting entities without a physical group.
-
-    With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. In format 2.2,
-    these cells have tag 0. In format 4.1, these cells have no tag, and meshio fails; in
-    this case, tag 0 is inserted into a copy of the text.
-    """
-    import meshio  # imported here, because workers and other families do not need it
-
-    try:
-        return meshio.gmsh.read(path)  # meshio.read would print errors and exit
-    except ValueError as e:
-        if "gmsh:physical" not in str(e):
-            raise
-    head, start, rest = path.read_bytes().partition(b"$Entities")
-    if head.split(b"$MeshFormat")[1].split(maxsplit=2)[1] != b"0":
+    at = np.minimum(np.searchsorted(node[order], cells), node.size - 1)
+    if (node[order][at] != cells).any():
         raise InputError(
-            f"{path}: cells without a physical name in a binary file; expected {_SAVED}"
+            f"{path}: cells refer to nodes that are not in the file; define these "
+            "nodes or remove the cells"
         )
-    entities, end, rest = rest.partition(b"$EndEntities")
-    lines = [line.split() for line in entities.split(b"\n") if line.split()]
-    points = int(lines[0][0])
-    for i, fields in enumerate(lines[1:]):
-        # the number of physical tags follows the tag of the entity and the position of
-        # a point (3 numbers) or the bounding box of other entities (6 numbers)
-        at = 4 if i < points else 7
-        if fields[at] == b"0":
-            fields[at : at + 1] = [b"1", b"0"]
-    text = b"\n".join([b"", *(b" ".join(fields) for fields in lines), b""])
-    with TemporaryDirectory() as folder:
-        copy = Path(folder) / path.name
-        copy.write_bytes(head + start + text + end + rest)
-        return meshio.gmsh.read(copy)
-
-
-def _numbers(data: bytes) -> NDArray[np.int64] | None:
-    """Return the node numbers in the cells of a text file; None for a binary file."""
-    head, _, rest = data.partition(b"$Elements")
-    version, kind, _ = head.split(b"$MeshFormat")[1].split(maxsplit=3)[:3]
-    if kind != b"0":
-        return None
-    # skip the end of the section's title and the line with the counts
-    lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]
-    numbers: list[int] = []
-    remaining = 0  # number of remaining cells of the current block, in format 4
-    for fields in (list(map(int, line.split())) for line in lines):
-        if not fields:
-            continue
-        if version.startswith(b"2"):
-            numbers += fields[3 + fields[2] :]
-        elif remaining == 0:
-            remaining = fields[3]
-        else:
-            numbers += fields[1:]
-            remaining -= 1
-    return np.array(numbers, dtype=np.int64)
+    return order[at]

@@ -1,20 +1,24 @@
-"""Reader of Abaqus and CalculiX input files (.inp) without parts and instances.
+"""Reader of Abaqus and CalculiX input files (.inp).
 
-The keywords *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE define the mesh. Any other
-keyword is an error if it would change the mesh, and is skipped otherwise. meshio's
-reader is not used, because it drops *SURFACE, all but the last *NODE block and plane
-strain elements, assigns the sets that *ELEMENT defines to the wrong block of cells, and
-opens any file named by *INCLUDE.
+The keywords *NODE, *ELEMENT, *NSET, *ELSET, *SURFACE, *PART and *INSTANCE define the
+mesh. Any other keyword is an error if it would change the mesh, and is skipped
+otherwise. meshio's reader is not used, because it drops *SURFACE, all but the last
+*NODE block and plane strain elements, assigns the sets that *ELEMENT defines to the
+wrong block of cells, and opens any file named by *INCLUDE.
 
-Reference: G. Dhondt, CalculiX CrunchiX USER'S MANUAL, sections on *ELEMENT and *DLOAD
-(numbers of element faces).
+An instance repeats the nodes, elements, sets and surfaces of its part, whose names are
+INSTANCE.NAME outside the instance. All its elements form the element set INSTANCE.
+
+References: G. Dhondt, CalculiX CrunchiX USER'S MANUAL, sections on *ELEMENT and *DLOAD
+(numbers of element faces); Dassault Systèmes, Abaqus Keywords Guide, *INSTANCE.
 """
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,6 +67,23 @@ _FAMILIES = {
     "R2D": 1,
 }
 _TYPE = re.compile(r"([A-Z]+(?:[23]D)?)(\d+)[A-Z]*\d?")
+#: descriptions of element types without a counterpart, by the start of their names
+_OTHERS = {
+    "CAX": "an axisymmetric element",
+    "CGAX": "an axisymmetric element",
+    "DCAX": "an axisymmetric element",
+    "SAX": "an axisymmetric shell",
+    "MASS": "a point mass",
+    "ROTARYI": "a rotary inertia",
+    "SPRING": "a spring",
+    "DASHPOT": "a dashpot",
+    "CONN": "a connector",
+    "GAP": "a gap element",
+    "COH": "a cohesive element",
+    "B2": "a beam",
+    "B3": "a beam",
+    "PIPE": "a pipe",
+}
 #: corners of the faces S1, S2, … of the cells of each kind, counted from 0
 _FACES: Mapping[str, Sequence[Sequence[int]]] = {
     "triangle": ((0, 1), (1, 2), (2, 0)),
@@ -74,43 +95,70 @@ _FACES: Mapping[str, Sequence[Sequence[int]]] = {
         (3, 7, 4, 0),
     ),
 }  # fmt: skip
-_FLAT = "expected a file of *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE alone"
 #: mapping from a rejected keyword, which would change the mesh, to the remedy in the
 #: message
 _REFUSED = {
     "INCLUDE": "other files are not opened; expected all data in this file",
-    "PART": f"{_FLAT}: in Abaqus/CAE, Model, Edit Attributes, Do not use parts and "
-    "assemblies in input files",
-    "INSTANCE": _FLAT,
-    "SYSTEM": _FLAT,
-    "NGEN": _FLAT,
-    "NFILL": _FLAT,
-    "NCOPY": _FLAT,
-    "NMAP": _FLAT,
-    "ELGEN": _FLAT,
-    "ELCOPY": _FLAT,
+    **dict.fromkeys(
+        ("SYSTEM", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY"),
+        "it generates or moves nodes or elements; expected *NODE and *ELEMENT with all "
+        "of them",
+    ),
 }
+#: numbers of nodes and elements of instance k = 1, 2, … are increased by k times this
+#: value, which exceeds the numbers that Abaqus accepts
+_STRIDE = 10**9
+
+
+class _Scope(NamedTuple):
+    """The whole model, or an instance of a part."""
+
+    number: int = 0  #: 0 for the model; instances count from 1
+    prefix: str = ""  #: prefix of names that the scope defines
+    #: motion of points (k, 3) from the part to the instance
+    move: Callable[[NDArray[np.float64]], NDArray[np.float64]] = lambda points: points
+
+    @property
+    def offset(self) -> int:
+        """Increase of numbers."""
+        return self.number * _STRIDE
 
 
 class _Section(NamedTuple):
     """A keyword with its parameters and data lines."""
 
+    line: int  #: number of the line of the keyword, from 1
     keyword: str
     params: Mapping[str, str]
-    lines: list[str]
+    lines: list[tuple[int, list[str]]]  #: line numbers and fields
+    scope: _Scope = _Scope()
 
-    @property
-    def fields(self) -> list[str]:
-        """All non-empty fields of the data lines."""
-        fields = (field.strip() for line in self.lines for field in line.split(","))
-        return [field for field in fields if field]
+    def name(self, key: str) -> str:
+        """Return the name that the parameter `key` defines."""
+        if not self.params.get(key, ""):
+            raise InputError(
+                f"line {self.line}: *{self.keyword} without a name; expected {key}=NAME"
+            )
+        return self.scope.prefix + self.params[key]
+
+
+def _number(text: str, line: int, kind: Callable[[str], float] = float) -> float:
+    """Return a number, whose exponent may be written with D as in Fortran."""
+    try:
+        if "_" not in text:
+            return kind(re.sub("[dD]", "e", text))
+    except ValueError:
+        pass
+    what = "an integer" if kind is int else "a number"
+    raise InputError(f"line {line}: {shortened(text)!r}; expected {what}")
 
 
 class _Sets:
     """Named sets of node or element numbers; names are case-insensitive."""
 
-    def __init__(self, numbers: Nodes, limit: int) -> None:
+    def __init__(self, numbers: Nodes, scopes: Sequence[_Scope], limit: int) -> None:
         self.numbers = numbers  #: (k,) all node or element numbers in the file, sorted
+        self._scopes = {scope.prefix.upper(): scope for scope in scopes}
         self._limit = limit  #: number of members that may still be added
         self._members: dict[str, tuple[str, Nodes]] = {}
 
@@ -126,44 +174,66 @@ class _Sets:
             )
         self._members[name.upper()] = name, members
 
-    def resolve(self, fields: Iterable[str], where: str) -> Nodes:
-        """Return the members listed as numbers or as names of other sets."""
-        fields, numbers = list(fields), np.zeros(0, dtype=np.int64)
-        names = [field for field in fields if not field.isdecimal()]
-        if len(names) < len(fields):
-            numbers = np.array([int(v) for v in fields if v.isdecimal()])
-        if (bad := ~np.isin(numbers, self.numbers)).any():
-            raise InputError(
-                f"{where} contains {numbers[bad][0]}, which is not in the file; "
-                "expected numbers of nodes or elements in the file"
-            )
-        for name in names:
-            if name.upper() not in self._members:
-                raise unknown("set", name, self.by_name(), where=where)
-        others = [self._members[name.upper()][1] for name in names]
-        return np.concatenate([numbers, *others])
+    def scope_of(self, section: _Section) -> _Scope:
+        """Return the scope of the members of a section, which may name an instance."""
+        if not (name := section.params.get("INSTANCE", "")):
+            return section.scope
+        if (scope := self._scopes.get(f"{name.upper()}.")) is None:
+            known = (scope.prefix[:-1] for scope in self._scopes.values())
+            raise unknown("instance", name, known, where=f"line {section.line}")
+        return scope
 
-    def generate(self, section: _Section) -> Nodes:
-        """Return the members of the ranges "first, last[, step]" of a section."""
-        parts = [_NONE]
-        for line in section.lines:
-            first, last, *step = (int(v) for v in line.split(",") if v.strip())
+    def resolve(
+        self, fields: Iterable[str], where: str, line: int, scope: _Scope
+    ) -> Nodes:
+        """Return the members listed as numbers or as names of other sets.
+
+        Outside instances, INSTANCE.5 is a number of that instance.
+        """
+        numbers, others = list[int](), [_NONE]
+        for field in fields:
+            prefix, _, last = field.rpartition(".")
+            within = self._scopes.get(f"{prefix.upper()}.", scope) if prefix else scope
+            names = [f"{scope.prefix}{field}".upper(), field.upper()]
+            found = [name for name in names if name in self._members]
+            if found:
+                others.append(self._members[found[0]][1])
+            elif field.isdecimal() or (last.isdecimal() and within is not scope):
+                numbers.append(int(last) + within.offset)
+            else:
+                raise unknown("set", field, self.by_name(), f"line {line}: {where}")
+        members = np.array(numbers, dtype=np.int64)
+        if (bad := ~np.isin(members, self.numbers)).any():
+            raise InputError(
+                f"line {line}: {where} contains {members[bad][0] % _STRIDE}, which is "
+                "not in the file; expected numbers of nodes or elements in the file"
+            )
+        return np.concatenate([members, *others])
+
+    def members(self, section: _Section, where: str) -> Nodes:
+        """Return the members that the data lines of a section list."""
+        scope, parts = self.scope_of(section), [_NONE]
+        for line, fields in section.lines:
+            if "GENERATE" not in section.params:
+                parts.append(self.resolve(filter(None, fields), where, line, scope))
+                continue
+            values = [int(_number(field, line, int)) for field in fields if field]
+            if len(values) not in (2, 3) or min(values[2:], default=1) < 1:
+                raise InputError(f"line {line}: {where}; expected first, last, step")
+            first, last = (value + scope.offset for value in values[:2])
             k = self.numbers[(self.numbers >= first) & (self.numbers <= last)]
-            parts.append(k[(k - first) % (step[0] if step else 1) == 0])
+            parts.append(k[(k - first) % (*values, 1)[2] == 0])
         return np.concatenate(parts)
 
     def read(self, sections: Sequence[_Section], keyword: str) -> None:
         """Add the sets defined by sections with `keyword`."""
         for section in sections:
-            if section.keyword == keyword:
-                name = _name(section, keyword)
-                is_range = "GENERATE" in section.params
-                self.extend(
-                    name,
-                    self.generate(section)
-                    if is_range
-                    else self.resolve(section.fields, f"set {shortened(name)!r}"),
-                )
+            if section.keyword == keyword and not (
+                keyword == "NSET" and "ELSET" in section.params
+            ):
+                name = section.name(keyword)
+                members = self.members(section, f"set {shortened(name)!r}")
+                self.extend(name, members)
 
     def by_name(self) -> dict[str, Nodes]:
         """Return the sorted members of all sets by name."""
@@ -190,7 +260,7 @@ _NONE = np.zeros(0, dtype=np.int64)
 
 
 def read_inp(path: Path) -> FileMesh:
-    """Read the nodes, elements, sets and surfaces of an .inp file.
+    """Read the nodes, elements, sets, surfaces and instances of an .inp file.
 
     The facets of a surface of elements become a named set of cells.
 
@@ -199,31 +269,32 @@ def read_inp(path: Path) -> FileMesh:
     InputError
         If the file is damaged, refers to other files, has keywords that generate nodes
         or elements, or contains elements other than linear solids, shells and trusses.
+        The message states the line, where possible.
 
     """
     text = content(path, "an .inp file", copies=_PARSER_FACTOR)
     limit = _PARSER_FACTOR * len(text)
     with parsing(path, "not an .inp file of Abaqus or CalculiX, or damaged", limit):
         try:
-            return _mesh(path, list(_sections(text.decode("latin-1"))), limit)
+            return _mesh(path, _instances(_sections(text.decode("latin-1"))), limit)
         except InputError as e:
             raise InputError(f"{path}: {e}") from None
 
 
 def _sections(text: str) -> Iterator[_Section]:
     """Split a file at its keywords and drop comments."""
-    section, is_continued = _Section("", {}, []), False
-    for line in text.split("\n"):
+    section, is_continued = _Section(0, "", {}, []), False
+    for number, line in enumerate(text.split("\n"), 1):
         if line.startswith("**") or not line.strip():
             continue
         if not line.startswith("*") and not is_continued:
-            section.lines.append(line)
+            section.lines.append((number, [f.strip() for f in line.split(",")]))
             continue
         pairs = line.split(",")
         if not is_continued:
             yield section
-            keyword = pairs.pop(0)[1:].strip().upper()
-            section = _Section(keyword, {}, [])
+            keyword = " ".join(pairs.pop(0)[1:].upper().split())
+            section = _Section(number, keyword, {}, [])
         params = {
             key.strip().upper(): value.strip().strip('"')
             for key, _, value in (pair.partition("=") for pair in pairs)
@@ -233,36 +304,124 @@ def _sections(text: str) -> Iterator[_Section]:
     yield section
 
 
-def _mesh(path: Path, sections: Sequence[_Section], limit: int) -> FileMesh:
-    """Return the mesh that the sections of a file define."""
+def _instances(sections: Iterable[_Section]) -> list[_Section]:
+    """Replace each instance by the sections of its part, in the scope of the instance.
+
+    Raises
+    ------
+    InputError
+        If a keyword would change the mesh, or a part is unknown.
+
+    """
+    model, parts, count = list[_Section](), dict[str, list[_Section]](), 0
+    target, scope = model, _Scope()
     for section in sections:
         keyword = "INCLUDE" if "INPUT" in section.params else section.keyword
-        if keyword in _REFUSED:
-            raise InputError(f"*{section.keyword}: {_REFUSED[keyword]}")
-    number, points, node_sets = _nodes(sections, limit)
-    elements, element_sets = _elements(sections, number, limit)
-    node_sets.read(sections, "NSET")
+        is_rotated = keyword == "NODE" and section.params.get("SYSTEM", "R") != "R"
+        if keyword in _REFUSED or is_rotated:
+            raise InputError(
+                f"line {section.line}: *{section.keyword}: "
+                f"{_REFUSED['SYSTEM' if is_rotated else keyword]}"
+            )
+        if keyword == "PART":
+            target = parts[section.name("NAME").upper()] = []
+        elif keyword == "INSTANCE":
+            count += 1
+            part = section.params.get("PART", "")
+            if part.upper() not in parts:
+                raise unknown("part", part, parts, where=f"line {section.line}")
+            prefix = f"{section.name('NAME')}."
+            scope, target = _Scope(count, prefix, _motion(section)), model
+            model += [one._replace(scope=scope) for one in parts[part.upper()]]
+        elif keyword in ("END PART", "END INSTANCE"):
+            target, scope = model, _Scope()
+        else:
+            target.append(section._replace(scope=scope))
+    if parts and not count:
+        raise InputError("*PART without *INSTANCE; expected an instance of each part")
+    return model
+
+
+def _motion(
+    section: _Section,
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return the motion of an instance: a translation, then a rotation.
+
+    The second data line contains two points of the axis, and the angle in degrees.
+    """
+    numbers = [
+        [_number(field, line) for field in fields if field]
+        for line, fields in section.lines
+    ]
+    if [len(row) for row in numbers] not in ([], [3], [2], [3, 7]):
+        raise InputError(
+            f"line {section.line}: *INSTANCE; expected a line with a translation, and "
+            "a line with two points of an axis and an angle"
+        )
+    shift, turn = numbers + [[0.0] * 3, [0.0] * 7][len(numbers) :]
+    return partial(_moved, shift, turn)
+
+
+def _moved(
+    shift: list[float], turn: list[float], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Translate points (k, 3), then rotate them about an axis (Rodrigues' formula)."""
+    points = points + (*shift, 0.0)[:3]
+    start, axis = np.array(turn[:3]), np.subtract(turn[3:6], turn[:3])
+    if not (size := float(np.linalg.norm(axis))) or not turn[6]:
+        return np.asarray(points)
+    k, x, angle = axis / size, points - start, np.deg2rad(turn[6])
+    along = np.outer(x @ k, k)
+    across = (x - along) * np.cos(angle) + np.cross(k, x) * np.sin(angle)
+    return np.asarray(start + along + across)
+
+
+def _mesh(path: Path, sections: Sequence[_Section], limit: int) -> FileMesh:
+    """Return the mesh that the sections of a file define."""
+    scopes = list(
+        {section.scope.number: section.scope for section in sections}.values()
+    )
+    number, points, node_sets = _nodes(sections, scopes, limit)
+    elements, element_sets = _elements(sections, number, scopes, limit)
     element_sets.read(sections, "ELSET")
-    kinds = list(elements.cells)
-    tables: dict[str, list[Nodes]] = {k: [elements.cells[k]] for k in kinds}
-    chosen: dict[tuple[int, str], dict[str, Nodes]] = defaultdict(dict)
+    for scope in scopes:
+        if scope.number:
+            members = elements.number[elements.number // _STRIDE == scope.number]
+            element_sets.extend(scope.prefix[:-1], members)
+    corners = {
+        kind: number[elements.cells[kind]] for kind in elements.cells
+    }  # numbers of the nodes
+    for section in sections:
+        if section.keyword == "NSET" and "ELSET" in section.params:
+            rows = elements.rows(
+                element_sets.resolve(
+                    [section.params["ELSET"]],
+                    f"set {shortened(section.name('NSET'))!r}",
+                    section.line,
+                    element_sets.scope_of(section),
+                )
+            )
+            nodes = [corners[kind][k].ravel() for kind, k in rows.items()]
+            node_sets.extend(section.name("NSET"), np.concatenate([_NONE, *nodes]))
+    node_sets.read(sections, "NSET")
+    tables = {kind: [cells] for kind, cells in elements.cells.items()}
+    sets: dict[int, dict[str, dict[str, Nodes]]] = defaultdict(
+        lambda: defaultdict(dict)
+    )
     for name, members in element_sets.by_name().items():
-        for kind, rows in elements.rows(members).items():
-            chosen[DIMENSION[kind], name][kind] = rows
+        for kind, rows_of_kind in elements.rows(members).items():
+            sets[DIMENSION[kind]][name][kind] = rows_of_kind
     for name, facets in _surfaces(sections, elements, element_sets, node_sets).items():
-        for kind, corners in facets.items():
+        for kind, parts in facets.items():
             before = sum(map(len, tables.setdefault(kind, [])))
-            tables[kind].append(np.concatenate(corners))
-            rows = before + np.arange(len(tables[kind][-1]))
-            chosen[DIMENSION[kind], name][kind] = rows
-    cell_sets: dict[int, dict[str, list[Nodes]]] = defaultdict(dict)
-    for (dim, name), rows_by_kind in chosen.items():
-        cell_sets[dim][name] = [rows_by_kind.get(kind, _NONE) for kind in tables]
+            tables[kind].append(np.concatenate(parts))
+            rows_of_kind = before + np.arange(len(tables[kind][-1]))
+            sets[DIMENSION[kind]][name][kind] = rows_of_kind
     return FileMesh(
         path=path,
         points=points,
-        blocks=[(kind, np.concatenate(parts)) for kind, parts in tables.items()],
-        cell_sets=cell_sets,
+        cells={kind: np.concatenate(parts) for kind, parts in tables.items()},
+        cell_sets=sets,
         node_sets={
             name: np.searchsorted(number, members)
             for name, members in node_sets.by_name().items()
@@ -272,30 +431,41 @@ def _mesh(path: Path, sections: Sequence[_Section], limit: int) -> FileMesh:
 
 
 def _nodes(
-    sections: Sequence[_Section], limit: int
+    sections: Sequence[_Section], scopes: Sequence[_Scope], limit: int
 ) -> tuple[Nodes, NDArray[np.float64], _Sets]:
-    """Return the sorted numbers of all nodes, their coordinates, and their sets."""
-    tables, names = [], []
+    """Return the sorted numbers of all nodes, their coordinates, and their sets.
+
+    Missing coordinates are zero.
+    """
+    numbers, tables, named = [_NONE], [np.zeros((0, 3))], []
     for section in sections:
-        if section.keyword == "NODE" and section.lines:
-            columns = sum(1 for field in section.lines[0].split(",") if field.strip())
-            table = np.array([float(field) for field in section.fields])
-            tables.append(table.reshape(-1, columns))
-            names.append(section.params.get("NSET", ""))
-    if not tables:
+        if section.keyword != "NODE":
+            continue
+        number, table = list[int](), list[list[float]]()
+        for line, fields in section.lines:
+            number.append(int(_number(fields[0], line, int)))
+            x = [_number(field, line) if field else 0.0 for field in fields[1:4]]
+            table.append(x + [0.0] * (3 - len(x)))
+        at = np.array(number, dtype=np.int64) + section.scope.offset
+        numbers.append(at)
+        tables.append(section.scope.move(np.reshape(table, (-1, 3))))
+        if section.params.get("NSET", ""):
+            named.append((section.name("NSET"), at))
+    number_ = np.concatenate(numbers)
+    if not number_.size:
         raise InputError("no nodes; expected *NODE and *ELEMENT")
-    nodes = np.concatenate(tables)
-    number = nodes[:, 0].astype(np.int64)
-    order = np.argsort(number)
-    sets = _Sets(_distinct(number, "node"), limit)
-    for table, name in zip(tables, names, strict=True):
-        if name:
-            sets.extend(name, table[:, 0].astype(np.int64))
-    return number[order], nodes[order, 1:], sets
+    order = np.argsort(number_)
+    sets = _Sets(_distinct(number_, "node"), scopes, limit)
+    for name, at in named:
+        sets.extend(name, at)
+    return number_[order], np.concatenate(tables)[order], sets
 
 
 def _elements(
-    sections: Sequence[_Section], nodes: Nodes, limit: int
+    sections: Sequence[_Section],
+    nodes: Nodes,
+    scopes: Sequence[_Scope],
+    limit: int,
 ) -> tuple[_Elements, _Sets]:
     """Return all elements, and the element sets that *ELEMENT defines."""
     tables: dict[str, list[Nodes]] = {}
@@ -303,46 +473,68 @@ def _elements(
     for section in sections:
         if section.keyword != "ELEMENT":
             continue
-        kind = _kind(section.params.get("TYPE", ""))
-        table = np.array([int(field) for field in section.fields], dtype=np.int64)
-        table = table.reshape(-1, 1 + CORNERS[kind])
+        kind = _kind(section.params.get("TYPE", ""), section.line)
+        table = _table(section, kind)
+        if (bad := ~np.isin(table[:, 1:], nodes)).any():
+            k, corner = np.argwhere(bad)[0]
+            raise InputError(
+                f"element {table[k, 0] % _STRIDE} refers to node "
+                f"{table[k, 1 + corner] % _STRIDE}, which is not in the file; define "
+                "it under *NODE"
+            )
         tables.setdefault(kind, []).append(table)
-        if name := section.params.get("ELSET", ""):
-            named.append((name, table[:, 0]))
+        if section.params.get("ELSET", ""):
+            named.append((section.name("ELSET"), table[:, 0]))
     if not tables:
         raise InputError("no elements; expected *NODE and *ELEMENT")
-    cells, numbers = {}, {}
-    for kind, parts in tables.items():
-        table = np.concatenate(parts)
-        corners = table[:, 1:]
-        if (bad := ~np.isin(corners, nodes)).any():
-            raise InputError(
-                f"element {table[bad.any(axis=1), 0][0]} refers to node "
-                f"{corners[bad][0]}, which is not in the file; define it under *NODE"
-            )
-        cells[kind], numbers[kind] = np.searchsorted(nodes, corners), table[:, 0]
-    number = np.concatenate(list(numbers.values()))
+    whole = {kind: np.concatenate(parts) for kind, parts in tables.items()}
+    number = np.concatenate([table[:, 0] for table in whole.values()])
     order = np.argsort(number)
-    sets = _Sets(_distinct(number, "element"), limit)
+    sets = _Sets(_distinct(number, "element"), scopes, limit)
     for name, members in named:
         sets.extend(name, members)
-    sizes = [n.size for n in numbers.values()]
+    sizes = [len(table) for table in whole.values()]
     return _Elements(
-        cells=cells,
+        cells={k: np.searchsorted(nodes, table[:, 1:]) for k, table in whole.items()},
         number=number[order],
-        kind=np.repeat(list(cells), sizes)[order],
+        kind=np.repeat(list(whole), sizes)[order],
         row=np.concatenate([np.arange(size) for size in sizes])[order],
     ), sets
 
 
-def _kind(name: str) -> str:
+def _table(section: _Section, kind: str) -> Nodes:
+    """Return the numbers (k, 1 + corners) of elements and of their nodes.
+
+    The data of an element continue on the next line after a comma.
+    """
+    width, rows, row = 1 + CORNERS[kind], list[list[int]](), list[int]()
+    for line, fields in section.lines:
+        row += [int(_number(field, line, int)) for field in fields if field]
+        if len(row) < width and not fields[-1]:
+            continue
+        if len(row) != width:
+            raise InputError(
+                f"line {line}: an element with {len(row) - 1} nodes; "
+                f"{section.params['TYPE']} has {width - 1}"
+            )
+        rows.append(row)
+        row = []
+    if row:
+        raise InputError(f"line {section.line}: the last element has too few nodes")
+    return np.array(rows, dtype=np.int64).reshape(-1, width) + section.scope.offset
+
+
+def _kind(name: str, line: int) -> str:
     """Return meshio's name for the cells of an element type."""
-    match = _TYPE.fullmatch(name.upper())
+    upper = name.upper()
+    match = _TYPE.fullmatch(upper)
     dim = _FAMILIES.get(match[1], -1) if match else -1
     kind = KINDS.get((dim, int(match[2]) if match else 0))
     if kind is None:
+        what = [text for start, text in _OTHERS.items() if upper.startswith(start)]
         raise InputError(
-            f"elements of type {shortened(name)}; expected elements of first order: "
+            f"line {line}: elements of type {shortened(name)}"
+            f"{f', {what[0]}' if what else ''}; expected elements of first order: "
             f"{_WORDS.linear}"
         )
     return kind
@@ -362,22 +554,24 @@ def _surfaces(
     for section in sections:
         if section.keyword != "SURFACE":
             continue
-        name = _name(section, "NAME")
+        name = section.name("NAME")
         where = f"surface {shortened(name)!r}"
-        if section.params.get("TYPE", "ELEMENT").upper() == "NODE":
-            sets = [line.partition(",")[0].strip() for line in section.lines]
-            node_sets.extend(name, node_sets.resolve(sets, where))
-            continue
-        facets = surfaces.setdefault(name, {})
-        for line in section.lines:
-            of, _, label = (field.strip(" ,\r") for field in line.partition(","))
-            members = element_sets.resolve([of], where)
+        is_nodal = section.params.get("TYPE", "ELEMENT").upper() == "NODE"
+        of_set = node_sets if is_nodal else element_sets
+        for line, (of, *labels) in section.lines:
+            members = of_set.resolve([of], where, line, of_set.scope_of(section))
+            if is_nodal:
+                node_sets.extend(name, members)
+                continue
+            facets, label = surfaces.setdefault(name, {}), (*labels, "")[0]
             for kind, rows in elements.rows(members).items():
                 faces = {
                     f"S{i}": face for i, face in enumerate(_FACES.get(kind, ()), 1)
                 }
                 if label.upper() not in faces:
-                    raise unknown(f"face of a {kind}", label, faces, where=where)
+                    raise unknown(
+                        f"face of a {kind}", label, faces, f"line {line}: {where}"
+                    )
                 face = list(faces[label.upper()])
                 facet = KINDS[DIMENSION[kind] - 1, len(face)]
                 corners = elements.cells[kind][rows][:, face]
@@ -385,18 +579,12 @@ def _surfaces(
     return surfaces
 
 
-def _name(section: _Section, key: str) -> str:
-    if not section.params.get(key, ""):
-        raise InputError(f"*{section.keyword} without a name; expected {key}=NAME")
-    return section.params[key]
-
-
 def _distinct(numbers: Nodes, what: str) -> Nodes:
     """Check that no number occurs twice, and return the sorted numbers."""
     distinct, counts = np.unique(numbers, return_counts=True)
     if (counts > 1).any():
         raise InputError(
-            f"{what} {distinct[counts.argmax()]} is defined {counts.max()} times; "
-            "expected every number once"
+            f"{what} {distinct[counts.argmax()] % _STRIDE} is defined "
+            f"{counts.max()} times; expected every number once"
         )
     return distinct

@@ -112,27 +112,25 @@ def _mesh(path: Path, nodes: Mapping[str, Any]) -> FileMesh:
     (name,), (grid,) = names, grids
     coordinates = np.asarray(nodes[f"{grid}/NOE/COO"][()], dtype=float)
     dim = int(nodes[f"ENS_MAA/{name}"].attrs["ESP"])
-    blocks: list[tuple[str, Nodes]] = []
-    families = []
+    cells, families = dict[str, Nodes](), dict[str, Nodes]()
     for key in [k for k in nodes if k.startswith(f"{grid}/MAI/") and k[-4:] == "/NOD"]:
         numbers = np.asarray(nodes[key][()], dtype=np.int64)
         kind = _KINDS.get(key.split("/")[-2], key.split("/")[-2])
         count = int(nodes[key].attrs["NBR"])
         # transpose, because NOD stores all first corners, then all second corners, …
-        blocks.append((kind, numbers.reshape(-1, count).T - 1))
-        families.append(_families(nodes, key[:-3], count))
-    cell_sets: dict[int, dict[str, list[Nodes]]] = {}
+        cells[kind] = numbers.reshape(-1, count).T - 1
+        families[kind] = _families(nodes, key[:-3], count)
+    cell_sets: dict[int, dict[str, dict[str, Nodes]]] = {}
     for group, ids in _groups(nodes, f"FAS/{name}/ELEME/").items():
-        for k, ((kind, _), family) in enumerate(zip(blocks, families, strict=True)):
+        for kind, family in families.items():
             if (rows := np.flatnonzero(np.isin(family, ids))).size:
                 sets = cell_sets.setdefault(DIMENSION.get(kind, -1), {})
-                none = np.zeros(0, dtype=np.int64)
-                sets.setdefault(group, [none] * len(blocks))[k] = rows
+                sets.setdefault(group, {})[kind] = rows
     at = _families(nodes, f"{grid}/NOE/", coordinates.size // dim)
     return FileMesh(
         path=path,
         points=coordinates.reshape(dim, -1).T,
-        blocks=blocks,
+        cells=cells,
         cell_sets=cell_sets,
         node_sets={
             group: np.flatnonzero(np.isin(at, ids))

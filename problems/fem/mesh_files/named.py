@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +13,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
-from mortarbench.harness.mechanics import KINDS, boundary_facets, cell_blocks
+from mortarbench.harness.mechanics import (
+    KINDS,
+    boundary_facets,
+    cell_blocks,
+    cell_facets,
+)
 from mortarbench.problems.fem.elements import ELEMENTS, cross
 from mortarbench.problems.fem.mesh import REPEATED, Nodes, is_triangle
 
@@ -40,16 +46,20 @@ class Words(NamedTuple):
     linear: str = "linear cells"  #: instruction for obtaining cells of first order
 
 
+#: rows in the tables of cells of a `FileMesh`, by kind of cell
+Rows = Mapping[str, Nodes]
+
+
 class FileMesh(NamedTuple):
     """Content of a mesh file: cells of any dimension, and sets of cells and nodes."""
 
     path: Path
     points: NDArray[np.float64]  #: (N, 2) or (N, 3) positions of the nodes
-    #: cells by kind, with meshio's names; node numbers start at 0
-    blocks: Sequence[tuple[str, NDArray[Any]]]
-    #: sets of cells by dimension and name; for each block, a set lists the rows of its
-    #: cells
-    cell_sets: Mapping[int, Mapping[str, Sequence[Nodes]]]
+    #: table of corners (k, corners) of the cells of each kind, by meshio's names; nodes
+    #: are numbered from 0
+    cells: Mapping[str, Nodes]
+    #: sets of cells by dimension and name
+    cell_sets: Mapping[int, Mapping[str, Rows]]
     node_sets: Mapping[str, Nodes]
     #: mapping from the dimension of the bodies to the terms
     vocabulary: Mapping[int, Words]
@@ -57,7 +67,7 @@ class FileMesh(NamedTuple):
     @property
     def dim(self) -> int:
         """Dimension of the bodies: 3 if there are solid cells, otherwise 2."""
-        return max([2, *(_dimension(kind) for kind, _ in self.blocks)])
+        return max([2, *map(_dimension, self.cells)])
 
     @property
     def words(self) -> Words:
@@ -69,21 +79,25 @@ class FileMesh(NamedTuple):
         """Names of the sets of cells that may be bodies."""
         return tuple(self.cell_sets.get(self.dim, {}))
 
-    def cells(self, dim: int, rows: Sequence[Nodes]) -> Nodes:
+    def set_of(self, body: str) -> str:
+        """Return the name of the set of a body, where NAME.1 is a body of NAME."""
+        stem, _, part = body.rpartition(".")
+        is_part = part.isdecimal() and body not in self.body_names
+        return stem if is_part and stem in self.body_names else body
+
+    def table(self, dim: int, rows: Rows) -> Nodes:
         """Return selected cells of dimension `dim` as a single array (E, c).
 
         Triangles are stored as degenerate quadrilaterals, c = 4. If the file contains
         solid cells of several kinds, tetrahedra and wedges are stored as degenerate
         hexahedra, c = 8.
-
-        rows : for each block, the rows of the selected cells
         """
-        is_mixed = len({kind for kind, _ in self.blocks if DIMENSION[kind] == 3}) > 1
+        is_mixed = sum(DIMENSION[kind] == 3 for kind in self.cells) > 1
         parts: list[Nodes] = []
-        for (kind, nodes), selected in zip(self.blocks, rows, strict=True):
-            if DIMENSION[kind] != dim or not len(selected):
+        for kind, nodes in self.cells.items():
+            if DIMENSION[kind] != dim or not len(rows.get(kind, ())):
                 continue
-            part = np.asarray(nodes, dtype=np.int64)[selected]
+            part = np.asarray(nodes, dtype=np.int64)[rows[kind]]
             if kind == "triangle":
                 part = part[:, [0, 1, 2, 2]]
             elif is_mixed and kind in REPEATED:
@@ -103,6 +117,8 @@ class NamedMesh(NamedTuple):
     curves: Mapping[str, Nodes]
     #: nodes of each named point or set of nodes and, in 3D, of each named curve
     spots: Mapping[str, Nodes]
+    #: piece of each body; bodies of one piece have common nodes
+    piece: Nodes
     words: Words = Words()
 
     @property
@@ -111,19 +127,21 @@ class NamedMesh(NamedTuple):
         return int(self.points.shape[1])
 
 
-def check_numbers(file: FileMesh) -> None:
-    """Raise InputError for invalid coordinates, kinds of cells or node numbers."""
+def checked_mesh(file: FileMesh) -> FileMesh:
+    """Check kinds of cells and node numbers; return the mesh with every cell once.
+
+    Cells with the same corners are one cell, which belongs to the sets of all of them.
+
+    Raises
+    ------
+    InputError
+        If a kind of cell is not supported, or a cell has nodes that are not in the
+        file, or repeats a node.
+
+    """
     path, points = file.path, file.points
-    if (
-        points.ndim != 2
-        or points.shape[1] not in (2, 3)
-        or not (abs(points) < MAX_COORDINATE).all()
-    ):
-        raise InputError(
-            f"{path}: coordinates are missing or not below {MAX_COORDINATE:g} in "
-            "magnitude; expected nodes with finite coordinates"
-        )
-    for kind, nodes in file.blocks:
+    cells, new = {}, {}
+    for kind, nodes in file.cells.items():
         if kind not in DIMENSION:
             remedy = _remedy(kind, file.words)
             raise InputError(f"{path}: cells of type {kind}; {remedy}")
@@ -132,57 +150,84 @@ def check_numbers(file: FileMesh) -> None:
                 f"{path}: {kind} cells with {nodes.shape[-1]} nodes; expected "
                 f"{CORNERS[kind]}"
             )
-        # meshio assigns −1 to nodes that the file does not define
         if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
             raise InputError(
                 f"{path}: cells refer to nodes that are not in the file; define these "
                 "nodes or remove the cells"
             )
+        corners = np.sort(nodes, axis=1)
+        if (bad := (np.diff(corners) == 0).any(axis=1)).any():
+            where = _place(points[nodes[bad.argmax()]])
+            raise InputError(
+                f"{path}: the {kind} around {where} repeats a node; expected distinct "
+                "corners"
+            )
+        _, first, place = np.unique(
+            corners, axis=0, return_index=True, return_inverse=True
+        )
+        order = np.argsort(first)
+        cells[kind], new[kind] = nodes[first[order]], np.argsort(order)[place.ravel()]
+    return file._replace(
+        cells=cells,
+        cell_sets={
+            dim: {
+                name: {kind: np.unique(new[kind][rows]) for kind, rows in of.items()}
+                for name, of in sets.items()
+            }
+            for dim, sets in file.cell_sets.items()
+        },
+    )
 
 
-def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
+def named_mesh(file: FileMesh, chosen: Collection[str] = ()) -> NamedMesh:
     """Select bodies and boundaries by name.
 
-    Sets of cells may overlap. The sets in `bodies` become bodies first. Then each other
+    Sets of cells may overlap. The sets in `chosen` become bodies first. Then each other
     set becomes a body, which consists of the cells of the set that belong to no body
-    yet; sets without such cells are skipped. Boundaries are sets of facets, and sets of
-    nodes that contain all corners of a facet on the boundary of the bodies.
+    yet; sets without such cells are skipped. A set NAME whose cells are not connected
+    by facets becomes the bodies NAME.1, NAME.2, … Boundaries are sets of facets, and
+    sets of nodes that contain all corners of a facet on the boundary of the bodies.
 
-    Nodes and cells are numbered body by body, as generalised inverses require. Within a
-    body, they keep the order of the file, where cells are grouped by kind. Nodes
-    without cells (such as centres of arcs) are dropped.
+    Bodies with common facets form a piece. Nodes are numbered piece by piece and cells
+    body by body, as generalised inverses require. Within a body, they keep the order of
+    the file, where cells are grouped by kind. Nodes without cells (such as centres of
+    arcs) are dropped.
 
     Raises
     ------
     InputError
         If the file contains no volumes and its nodes are not all at the same z, or if
         it contains no bodies, cells without a name, flat, folded or non-convex cells,
-        bodies that share cells or nodes, a body of several disconnected parts, or named
-        facets that are not on the boundary of the bodies.
+        bodies that share nodes but no facets, or named facets that are not on the
+        boundary of the bodies.
 
     """
     path, points, dim, words = file.path, file.points, file.dim, file.words
-    extent = np.ptp(points, axis=0).max(initial=0.0)
-    is_flat = points.shape[1] < 3 or (
-        np.ptp(points[:, 2]) <= FLATNESS_TOLERANCE * extent
-    )
-    if dim == 2 and not is_flat:
+    sets = {name: file.table(dim, rows) for name, rows in _bodies(file, chosen)}
+    if not sets:
+        raise InputError(f"{path}: no {words.body} with cells; expected {words.naming}")
+    cells = np.concatenate(list(sets.values()))
+    at = points[np.unique(cells)]
+    if not (abs(at) < MAX_COORDINATE).all():
+        raise InputError(
+            f"{path}: coordinates are missing or not below {MAX_COORDINATE:g} in "
+            "magnitude; expected nodes with finite coordinates"
+        )
+    extent = np.ptp(at, axis=0)
+    if dim == 2 and (extent[2:] > FLATNESS_TOLERANCE * extent.max()).any():
         raise InputError(
             f"{path}: the nodes are not all at the same z, and there are no volume "
             "cells; expected a plane mesh, or tetrahedra, wedges or hexahedra"
         )
-    parts = {name: file.cells(dim, rows) for name, rows in _bodies(file, bodies)}
-    if not parts:
-        raise InputError(f"{path}: no {words.body} with cells; expected {words.naming}")
-    used = _unique_in_order([np.unique(part) for part in parts.values()])
+    cells, surfaces, piece = _connected(
+        path, points[:, :dim], cells, dim, {k: len(v) for k, v in sets.items()}
+    )
+    used = _node_order(cells, list(surfaces.values()), piece)
     renumbered = np.full(len(points), -1)
     renumbered[used] = np.arange(used.size)
     points = points[used, :dim]
-    cells = renumbered[np.concatenate(list(parts.values()))]
-    cells = (_counter_clockwise if dim == 2 else _right_handed)(path, points, cells)
-    ends = np.cumsum([0] + [len(part) for part in parts.values()])
-    surfaces = {name: np.arange(ends[i], ends[i + 1]) for i, name in enumerate(parts)}
-    _check_apart(path, len(points), cells, surfaces, words)
+    orient = _counter_clockwise if dim == 2 else _right_handed
+    cells = orient(path, points, renumbered[cells])
     outer = boundary_facets(cells, dim)
     directed = {tuple(sorted(set(facet))): facet for facet in outer.tolist()}
     node_sets = {
@@ -196,7 +241,7 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
     }
     facets = {
         name: _directed(
-            path, name, renumbered[file.cells(dim - 1, rows)], directed, words
+            path, name, renumbered[file.table(dim - 1, rows)], directed, words
         )
         for name, rows in file.cell_sets.get(dim - 1, {}).items()
     }
@@ -204,7 +249,7 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
         name: nodes
         for below in range(dim - 1)
         for name, rows in file.cell_sets.get(below, {}).items()
-        for nodes in [renumbered[file.cells(below, rows)]]
+        for nodes in [renumbered[file.table(below, rows)]]
         if (nodes >= 0).all()
     }
     return NamedMesh(
@@ -214,6 +259,7 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
         curves={name: at for name, at in covered.items() if len(at)} | facets,
         spots={name: nodes for name, nodes in node_sets.items() if nodes.size}
         | {name: np.unique(nodes) for name, nodes in spots.items()},
+        piece=piece,
         words=words,
     )
 
@@ -258,7 +304,7 @@ def refine(mesh: NamedMesh) -> NamedMesh:
     children[:, ~is_quad, 3] = m[[0, 1, 3, 3]][:, ~is_quad]
     fine = np.ascontiguousarray(children.transpose(1, 2, 0))  # (E, 4 children, 4)
     of_edge = {(a, b): k for (a, b), k in zip(ends.tolist(), number, strict=True)}
-    used = _unique_in_order([np.unique(fine[part]) for part in mesh.surfaces.values()])
+    used = _node_order(fine, list(mesh.surfaces.values()), mesh.piece)
     renumbered = np.empty(len(points), dtype=np.int64)
     renumbered[used] = np.arange(used.size)
 
@@ -273,41 +319,123 @@ def refine(mesh: NamedMesh) -> NamedMesh:
         {k: (4 * v[:, None] + np.arange(4)).ravel() for k, v in mesh.surfaces.items()},
         {name: cut(curve) for name, curve in mesh.curves.items()},
         {name: renumbered[spot] for name, spot in mesh.spots.items()},
+        mesh.piece,
         mesh.words,
     )
 
 
-def _bodies(
-    file: FileMesh, chosen: Collection[str]
-) -> list[tuple[str, Sequence[Nodes]]]:
-    """Return the name of each body and its rows in each block, in file order."""
+def _bodies(file: FileMesh, chosen: Collection[str]) -> list[tuple[str, Rows]]:
+    """Return the name and the cells of each body, in file order."""
     path, dim, words = file.path, file.dim, file.words
     sets = file.cell_sets.get(dim, {})
-    owner = [np.full(len(nodes), -1) for _, nodes in file.blocks]
-    bodies: dict[str, Sequence[Nodes]] = {}
+    owner = {
+        kind: np.full(len(nodes), -1)
+        for kind, nodes in file.cells.items()
+        if DIMENSION[kind] == dim
+    }
+    bodies: dict[str, Rows] = {}
     for name in sorted(sets, key=lambda name: name not in chosen):
-        free = [rows[at[rows] < 0] for at, rows in zip(owner, sets[name], strict=True)]
-        count = sum(rows.size for rows in sets[name]) - sum(rows.size for rows in free)
+        free = {kind: rows[owner[kind][rows] < 0] for kind, rows in sets[name].items()}
+        count = sum(rows.size - free[kind].size for kind, rows in sets[name].items())
         if name in chosen and count:
             raise InputError(
                 f"{path}: {words.body} {name!r} shares {count} cells with another "
                 "body; expected bodies without common cells"
             )
-        if any(rows.size for rows in free):
-            for at, rows in zip(owner, free, strict=True):
-                at[rows] = len(bodies)
+        if any(rows.size for rows in free.values()):
+            for kind, rows in free.items():
+                owner[kind][rows] = len(bodies)
             bodies[name] = free
-    nameless = sum(
-        int((at < 0).sum())
-        for (kind, _), at in zip(file.blocks, owner, strict=True)
-        if DIMENSION[kind] == dim
-    )
-    if nameless:
+    if nameless := sum(int((at < 0).sum()) for at in owner.values()):
         raise InputError(
             f"{path}: {nameless} cells without a name; expected a name for each: "
             f"{words.naming}"
         )
     return [(name, bodies[name]) for name in sets if name in bodies]
+
+
+def _connected(
+    path: Path,
+    points: NDArray[np.float64],
+    cells: Nodes,
+    dim: int,
+    sizes: Mapping[str, int],
+) -> tuple[Nodes, dict[str, Nodes], Nodes]:
+    """Split sets of cells into bodies whose cells are connected by common facets.
+
+    cells : (E, c) cells, set by set
+    sizes : number of cells of each set
+
+    Returns
+    -------
+    cells, body by body; numbers of the cells of each body; piece (bodies,) of each body
+
+    Raises
+    ------
+    InputError
+        If more than two cells have a facet in common, or if bodies, or parts of a
+        body, have common nodes without a chain of common facets: they could rotate
+        about these nodes.
+
+    """
+    _, names, cell = cell_facets(cells, dim)
+    _, facet, count = np.unique(names, axis=0, return_inverse=True, return_counts=True)
+    facet = facet.ravel()
+    if (count > 2).any():
+        place = _place(points[names[(count > 2)[facet]][0]])
+        raise InputError(
+            f"{path}: {count.max()} cells overlap around {place}; expected at most two "
+            f"cells at {'an edge' if dim == 2 else 'a face'}"
+        )
+    order = np.argsort(facet, kind="stable")
+    is_pair = np.diff(facet[order]) == 0
+    one, other = cell[order][:-1][is_pair], cell[order][1:][is_pair]
+    of_set = np.repeat(np.arange(len(sizes)), list(sizes.values()))
+    inside = of_set[one] == of_set[other]
+    body = _components(one[inside], other[inside], len(cells))
+    order = np.lexsort((body, of_set))  # a body is in one set
+    parts = np.split(order, np.flatnonzero(np.diff(body[order])) + 1)
+    sets, surfaces, first = list(sizes), dict[str, Nodes](), 0
+    of_part = [sets[of_set[part[0]]] for part in parts]
+    several, seen = Counter(of_part), Counter[str]()
+    for k, (name, part) in enumerate(zip(of_part, parts, strict=True)):
+        seen[name] += 1
+        full = f"{name}.{seen[name]}" if several[name] > 1 else name
+        if full != name and full in sizes:
+            raise InputError(
+                f"{path}: {name!r} consists of {several[name]} separate parts, and "
+                f"{full!r} is another set; expected another name for it"
+            )
+        surfaces[full] = first + np.arange(part.size)
+        body[part], first = k, first + part.size
+    piece = _components(body[one], body[other], len(parts))
+    # pieces at the corners of cells: a node has a single one
+    at_node = np.full(len(points), -1)
+    at_node[cells] = piece[body][:, None]
+    if (hinge := at_node[cells] != piece[body][:, None]).any():
+        k, corner = np.argwhere(hinge)[0]
+        around = np.unique(body[(cells == cells[k, corner]).any(axis=1)])
+        pair = [list(surfaces)[b] for b in around]
+        raise InputError(
+            f"{path}: bodies {' and '.join(map(repr, pair))} share the node at "
+            f"{_place(points[cells[k, corner]][None])}, but no "
+            f"{'edge' if dim == 2 else 'face'}; expected separate nodes for each body, "
+            f"or a common {'edge' if dim == 2 else 'face'} of cells"
+        )
+    return cells[order], surfaces, piece
+
+
+def _components(one: Nodes, other: Nodes, count: int) -> Nodes:
+    """Return the connected component of each node of a graph, numbered in order."""
+    graph = coo_array((np.ones(one.size), (one, other)), shape=(count, count))
+    label = connected_components(graph, directed=False)[1]
+    first = np.unique(label, return_index=True)[1]
+    return np.asarray(np.argsort(np.argsort(first))[label])
+
+
+def _place(corners: NDArray[np.float64]) -> str:
+    """Return the centre of points (k, dim) as text."""
+    return "(" + ", ".join(f"{x:.6g}" for x in corners.mean(axis=0)) + ")"
 
 
 def _dimension(kind: str) -> int:
@@ -328,9 +456,13 @@ def _remedy(kind: str, words: Words) -> str:
     return f"expected {', '.join(DIMENSION)}, as meshio calls them"
 
 
-def _unique_in_order(parts: list[Nodes]) -> Nodes:
-    """Return the distinct nodes of all arrays, in the order of first occurrence."""
-    nodes = np.concatenate(parts)
+def _node_order(cells: Nodes, bodies: Sequence[Nodes], piece: Nodes) -> Nodes:
+    """Return the nodes of all bodies, piece by piece and ascending within a body.
+
+    bodies : numbers of the cells of each body
+    """
+    order = np.argsort(piece, kind="stable")
+    nodes = np.concatenate([np.unique(cells[bodies[b]]) for b in order])
     return nodes[np.sort(np.unique(nodes, return_index=True)[1])]
 
 
@@ -342,18 +474,18 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
     reversed_ = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
     cells = np.where(twice_area[:, None] < 0, reversed_, cells)
     if (flat := twice_area == 0).any():
-        x, y = points[cells[flat.argmax()]].mean(axis=0)
+        place = _place(points[cells[flat.argmax()]])
         raise InputError(
-            f"{path}: the cell around ({x:.6g}, {y:.6g}) has no area; expected "
+            f"{path}: the cell around {place} has no area; expected "
             "distinct corners, in their order around the cell"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
     # the boundary of a convex cell turns left at every corner
     corners = cross(np.roll(edges, 1, axis=1), edges)
     if (bad := ((corners <= 0) & ~triangle).any(axis=1)).any():
-        x, y = points[cells[bad.argmax()]].mean(axis=0)
+        place = _place(points[cells[bad.argmax()]])
         raise InputError(
-            f"{path}: the cell around ({x:.6g}, {y:.6g}) is not convex; "
+            f"{path}: the cell around {place} is not convex; "
             "expected interior angles below 180°"
         )
     return cells
@@ -369,9 +501,9 @@ def _right_handed(path: Path, points: NDArray[np.float64], cells: Nodes) -> Node
         det = np.linalg.det(J)
         mirrored = (det < 0).all(axis=1)
         if (bad := ~mirrored & (det <= 0).any(axis=1)).any():
-            x, y, z = points[block.nodes[bad.argmax()]].mean(axis=0)
+            place = _place(points[block.nodes[bad.argmax()]])
             raise InputError(
-                f"{path}: the {block.kind} around ({x:.6g}, {y:.6g}, {z:.6g}) has no "
+                f"{path}: the {block.kind} around {place} has no "
                 "volume or folds over; expected distinct corners, in gmsh's order"
             )
         nodes = block.nodes[mirrored][:, _MIRRORED[block.kind]]
@@ -379,32 +511,6 @@ def _right_handed(path: Path, points: NDArray[np.float64], cells: Nodes) -> Node
             nodes = nodes[:, REPEATED[block.kind]]
         cells[block.cells[mirrored]] = nodes
     return cells
-
-
-def _check_apart(
-    path: Path, nodes: int, cells: Nodes, surfaces: Mapping[str, Nodes], words: Words
-) -> None:
-    """Raise InputError for bodies that share nodes or are disconnected."""
-    owner = np.full(nodes, -1)
-    names = list(surfaces)
-    for i, name in enumerate(names):
-        of_body = np.unique(cells[surfaces[name]])
-        if (shared := owner[of_body] >= 0).any():
-            other = names[owner[of_body[shared.argmax()]]]
-            raise InputError(
-                f"{path}: bodies {other!r} and {name!r} share nodes; expected separate "
-                "nodes for each body"
-            )
-        owner[of_body] = i
-    start, end = cells[:, :-1].ravel(), cells[:, 1:].ravel()
-    graph = coo_array((np.ones(start.size), (start, end)), shape=(nodes, nodes))
-    _, part = connected_components(graph, directed=False)
-    for i, name in enumerate(names):
-        if (count := np.unique(part[owner == i]).size) > 1:
-            raise InputError(
-                f"{path}: body {name!r} consists of {count} disconnected parts; "
-                f"expected one {words.body} for each part"
-            )
 
 
 def _directed(

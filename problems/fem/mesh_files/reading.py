@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mortarbench.harness import InputError
 from mortarbench.problems.fem.mesh_files.gmsh import read_msh_sets
 from mortarbench.problems.fem.mesh_files.inp import read_inp
 from mortarbench.problems.fem.mesh_files.med import read_med
 from mortarbench.problems.fem.mesh_files.named import (
     FileMesh,
     NamedMesh,
-    check_numbers,
+    checked_mesh,
     named_mesh,
 )
 
-_READERS = {".inp": read_inp, ".med": read_med}
+_READERS = {
+    ".msh": read_msh_sets,
+    ".geo": read_msh_sets,
+    ".inp": read_inp,
+    ".med": read_med,
+}
 
 
 def read_mesh_file(path: Path) -> FileMesh:
-    """Read the cells and sets of an .inp, .med or (for any other suffix) .msh file.
+    """Read the cells and sets of a .msh, .inp or .med file.
 
     Raises
     ------
@@ -27,9 +33,12 @@ def read_mesh_file(path: Path) -> FileMesh:
         cells of higher order.
 
     """
-    file = _READERS.get(path.suffix.lower(), read_msh_sets)(path)
-    check_numbers(file)
-    return file
+    if (reader := _READERS.get(path.suffix.lower())) is None:
+        raise InputError(
+            f"{path}: a mesh of unknown format {path.suffix!r}; expected .msh (gmsh), "
+            ".inp (Abaqus, CalculiX) or .med (Salome)"
+        )
+    return checked_mesh(reader(path))
 
 
 def read_msh(path: Path) -> NamedMesh:
