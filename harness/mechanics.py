@@ -534,16 +534,18 @@ class Mechanics:
 
     ::
 
-        min ½uᵀKu − fᵀu    subject to   u = 0 on the prescribed components,  B u ≤ c
+        min ½uᵀKu − fᵀu    subject to   u = w on the prescribed components,  B u ≤ c
 
-    With `friction`, the friction work is added to the objective.
+    With `friction`, the friction work is added to the objective. The unknown of all
+    other members is u − w, with w = 0 on the components that are not prescribed. It is
+    zero on the prescribed components, its load is f − Kw, and its gaps are c − Bw.
     """
 
-    #: P = K, q = −f, G = B, h = c, b = 0; each row of A has a single entry 1, at a
+    #: P = K, q = −f, G = B, h = c, b = w; each row of A has a single entry 1, at a
     #: prescribed component
     primal: QP
-    #: maps a solution of the emitted QP to x = u, the multipliers y of the supports,
-    #: and the multipliers z of the contact and friction rows
+    #: maps a solution of the emitted QP to x = u − w, the multipliers y of the
+    #: supports, and the multipliers z of the contact and friction rows
     to_primal: Callable[[Solution], Solution]
     factorise: Callable[
         [], Inverse
@@ -598,16 +600,25 @@ class Mechanics:
         fixed = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
         softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
         softness[fixed] = 0
+        f, gaps, rows = -self.primal.q.astype(Real), c.astype(Real), B.astype(Real)
+        if self.lift.any():
+            f = f - self.stiffness @ self.lift
+            gaps = gaps - rows @ self.lift
         return Exact(
-            f=-self.primal.q.astype(Real),
-            B=B.astype(Real),
-            c=c.astype(Real),
+            f=f,
+            B=rows,
+            c=gaps,
             fixed=fixed,
             forces=AdmissibleForces(
                 c.size, self._active_friction.discs(self.primal.h.size)
             ),
             compliance=(B.multiply(B) @ softness).astype(Real),
         )
+
+    @cached_property
+    def lift(self) -> Extended:
+        """Prescribed displacements w (n,), zero on all other components."""
+        return np.asarray(self.primal.A.T @ self.primal.b).astype(Real)
 
     @cached_property
     def stiffness(self) -> Any:

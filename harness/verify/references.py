@@ -33,7 +33,11 @@ from mortarbench.harness.verify.active_set_refinement import (
     unconstrained_guess,
 )
 from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
-from mortarbench.harness.verify.certificate import UncertifiableError, proof
+from mortarbench.harness.verify.certificate import (
+    UncertifiableError,
+    including_lift,
+    proof,
+)
 from mortarbench.harness.verify.substructured import Undivided
 
 #: a result computed from the cache is discarded if its error bound exceeds this value
@@ -121,7 +125,9 @@ def _stored(path: Path, exact: Exact) -> ActiveSet | None:
 def _solved(mechanics: Mechanics, guess: ActiveSet) -> ReferencePoint:
     u, lam, active = exchanged(mechanics, guess)
     try:
-        certificate = proof(Undivided(mechanics), u, u, lam, active.closed)
+        certificate = including_lift(
+            mechanics, proof(Undivided(mechanics), u, u, lam, active.closed)
+        )
     except UncertifiableError as e:
         raise UnsolvedError(
             f"the reference solve found no admissible pair: {e}"
@@ -147,7 +153,7 @@ def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:
         mechanics.motions.constrained.toarray().astype(np.float64),
         mechanics.exact,
     )
-    f, B = -mechanics.primal.q, mechanics.rows
+    f, B = exact.f.astype(np.float64), mechanics.rows
     m = exact.c.size
     if not m or (m > MAX_DENSE_ROWS and not R.shape[1]):
         return unconstrained_guess(mechanics)

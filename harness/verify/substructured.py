@@ -307,7 +307,7 @@ class Undivided(_Stored):
     def residual(self, u: Extended) -> Residual:
         """Return Ku − f; θ = 0, since K_T and K define the same norm."""
         Ku, _, deformed = self.stored(u)
-        rho = self.free(Ku + self.mechanics.primal.q)
+        rho = self.free(Ku - self.mechanics.exact.f)
         return Residual(rho, deformed, self.product(deformed), 0.0)
 
     def spread(self, u: Extended) -> Extended:

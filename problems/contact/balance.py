@@ -62,7 +62,7 @@ def is_determined(bodies: UnassembledBodies, rows: Matrix) -> bool:
     rows : (m, n) normal rows, and tangential rows of contacts with friction
     """
     R, _, _ = _motions(bodies)
-    allowed = _kernel(bodies.B_D @ R)
+    allowed = _kernel(bodies.held @ R)
     return not _kernel(csr_array(rows) @ R @ allowed).shape[1]
 
 
@@ -79,16 +79,17 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
 
     """
     R, centres, size = _motions(bodies)
-    allowed = _kernel(bodies.B_D @ R)  # Z = R·allowed
+    allowed = _kernel(bodies.held @ R)  # Z = R·allowed
     if not allowed.shape[1]:  # the supports fix every body
         return
     load, closing = R.T @ bodies.f, csr_array(B) @ R
     threshold = MAX_IMBALANCE * np.abs(bodies.f).sum()
-    modes, dim = R.shape[1] // len(bodies.names), bodies.mesh.dim
+    names, dim = bodies.piece_names, bodies.mesh.dim
+    modes = R.shape[1] // len(names)
     # test translations along an axis first, because their message is simpler
     sliding = [
         (b, axis)
-        for b in range(len(bodies.names))
+        for b in range(len(names))
         for axis in range(dim)
         if abs(load[k := modes * b + axis]) > threshold
         and _is_free_motion(bodies, R[:, k], B, np.sign(load[k]))
@@ -96,9 +97,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     if sliding:
         first = sliding[0][0]
         axes = [_AXES[axis] for b, axis in sliding if b == first]
-        raise InputError(
-            _message([bodies.names[first]], f"its load in {' and '.join(axes)}")
-        )
+        raise InputError(_message([names[first]], f"its load in {' and '.join(axes)}"))
     # the least-squares residual is a motion that closes no gap and on which the load
     # does positive work
     motion = allowed @ _unbalanced_load(allowed.T @ load, closing @ allowed)
@@ -107,12 +106,11 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     parts = motion.reshape(-1, modes)
     moving = [
         _BodyMotion(name, centre, part[:dim], part[dim:])
-        for name, centre, part in zip(bodies.names, centres, parts, strict=True)
+        for name, centre, part in zip(names, centres, parts, strict=True)
         if np.abs(part).max() > _MIN_MOTION * np.abs(parts).max()
     ]
     held = {
-        bodies.names[b]
-        for b in bodies.body_of_node[bodies.B_D.indices // bodies.mesh.dim]
+        names[b] for b in bodies.piece_of_node[bodies.held.indices // bodies.mesh.dim]
     }
     raise InputError(_imbalance_message(moving, size, held))
 
@@ -139,7 +137,7 @@ def check_friction(
 
     """
     R, _, _ = _motions(bodies)
-    allowed = _kernel(bodies.B_D @ R)
+    allowed = _kernel(bodies.held @ R)
     if not allowed.shape[1] or not friction.bound.size:
         return
     # imported here, because it is rarely needed and slow to import
@@ -230,7 +228,7 @@ def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:
     are forces.
     """
     size = float(np.ptp(bodies.mesh.points, axis=0).max())
-    parts = bodies.points_of_bodies
+    parts = bodies.points_of_pieces
     motions = [rigid_motions(part) for part in parts]
     for R in motions:
         R[:, bodies.mesh.dim :] /= size
@@ -254,7 +252,7 @@ def _is_free_motion(
 ) -> bool:
     """Return True if the supports allow the motion sign·r and it closes no gap."""
     closing = sign * (B @ r)
-    free = not (bodies.B_D @ r).any()
+    free = not (bodies.held @ r).any()
     return free and bool((closing <= 1e-9).all())
 
 

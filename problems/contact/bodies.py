@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
-from scipy.sparse import csc_array, csr_array, eye_array
+from scipy.linalg import block_diag, null_space
+from scipy.sparse import csc_array, csr_array, eye_array, vstack
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.harness.mechanics import boundary_facets
@@ -29,7 +29,16 @@ from mortarbench.problems.fem.inverse import (
     regular_inverse,
     supported_inverse,
 )
-from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
+from mortarbench.problems.fem.mesh import (
+    Mesh,
+    Nodes,
+    dofs_of,
+    facet_quadrature,
+)
+
+#: rigid motions along which springs resist less than this fraction of the largest
+#: resistance count as free; the rounding of normals is about 1e-16
+SPRING_ROUNDING = 1e-10
 
 
 class ContactPair(NamedTuple):
@@ -112,17 +121,48 @@ class UnassembledBodies:
     #: (m_E, n) support rows of eq. (5), one unit entry per prescribed component
     B_D: csr_array
     pairs: tuple[ContactPair, ...]  #: sides that may touch
+    #: (bodies,) piece of each body; bodies of a piece have common nodes, and move
+    #: rigidly together. None: every body is a piece
+    piece: NDArray[np.int64] | None = None
+    #: (n,) prescribed displacements of the full load, divided by `length`, and zeros;
+    #: None: all are zero
+    lift: Vector | None = None
+    #: (s, n) rows S of springs, which add SᵀS to K', see `spring_rows`; None: no
+    #: springs
+    springs: csr_array | None = None
 
     def __post_init__(self) -> None:
-        if (np.diff(self.body_of_node) < 0).any():
+        if (np.diff(self.piece_of_node) < 0).any():
             raise ValueError("nodes must be numbered in the order of their bodies")
 
     @property
     def body_of_node(self) -> NDArray[np.int64]:
-        """Body of each node, (N,)."""
+        """Body of each node, (N,); the last one of several bodies."""
         owner = np.zeros(len(self.mesh.points), dtype=np.int64)
         owner[self.mesh.cells.ravel()] = np.repeat(self.body, self.mesh.cells.shape[1])
         return owner
+
+    @property
+    def pieces(self) -> NDArray[np.int64]:
+        """Piece of each body, (bodies,)."""
+        return np.arange(len(self.names)) if self.piece is None else self.piece
+
+    @property
+    def piece_of_node(self) -> NDArray[np.int64]:
+        """Piece of each node, (N,)."""
+        return self.pieces[self.body_of_node]
+
+    @property
+    def piece_names(self) -> tuple[str, ...]:
+        """Names of the bodies of each piece, joined by +."""
+        return joined_names(self.names, self.pieces)
+
+    @property
+    def held(self) -> csr_array:
+        """Rows of supports and springs, which resist rigid motions; entries ≤ 1."""
+        if (S := self.springs) is None:
+            return self.B_D
+        return csr_array(vstack([self.B_D, S / abs(S).max()]))
 
     @property
     def interface(self) -> Nodes:
@@ -132,13 +172,32 @@ class UnassembledBodies:
 
     @property
     def rigid(self) -> NDArray[np.float64]:
-        """Orthonormal rigid motions of each body, ignoring supports, (n, r·bodies)."""
-        return np.asarray(block_diag(*map(rigid_modes, self.points_of_bodies)))
+        """Orthonormal rigid motions of each piece, ignoring supports, (n, r).
+
+        Motions that springs resist are excluded.
+        """
+        return np.asarray(block_diag(*self.kernels))
 
     @property
-    def points_of_bodies(self) -> list[NDArray[np.float64]]:
-        """Nodes of each body, (N_b, dim)."""
-        ends = np.cumsum(np.bincount(self.body_of_node, minlength=len(self.names)))
+    def kernels(self) -> list[NDArray[np.float64]]:
+        """Orthonormal rigid motions (dim·N_p, r_p) of each piece p, see `rigid`."""
+        motions = list(map(rigid_modes, self.points_of_pieces))
+        if self.springs is None:
+            return motions
+        ends = np.cumsum([len(R) for R in motions])
+        resisted = [
+            self.springs[:, end - len(R) : end] @ R
+            for R, end in zip(motions, ends, strict=True)
+        ]
+        return [
+            R @ null_space(SR, rcond=SPRING_ROUNDING)
+            for R, SR in zip(motions, resisted, strict=True)
+        ]
+
+    @property
+    def points_of_pieces(self) -> list[NDArray[np.float64]]:
+        """Nodes of each piece, (N_p, dim)."""
+        ends = np.cumsum(np.bincount(self.piece_of_node))
         return np.split(self.mesh.points, ends[:-1])
 
     @property
@@ -218,6 +277,44 @@ def assemble(
     )
 
 
+def is_supported(bodies: UnassembledBodies) -> bool:
+    """Return True if supports and springs exclude all rigid motions of every piece."""
+    rigid = bodies.rigid
+    fixed = rigid[bodies.B_D.indices]
+    return not rigid.size or bool(np.linalg.matrix_rank(fixed) == rigid.shape[1])
+
+
+def joined_names(names: tuple[str, ...], piece: NDArray[np.int64]) -> tuple[str, ...]:
+    """Return the names of the bodies of each piece, joined by +.
+
+    piece : (bodies,) piece of each body
+    """
+    return tuple(
+        "+".join(name for name, at in zip(names, piece, strict=True) if at == k)
+        for k in range(int(piece.max(initial=-1)) + 1)
+    )
+
+
+def spring_rows(
+    points: NDArray[np.float64], facets: Nodes, stiffness: float
+) -> csr_array:
+    """Return rows S (s, n) with uᵀSᵀS u = ∫ k (n·u)² over the facets of a boundary.
+
+    There is one row per Gauss point, with the outward normal n at this point.
+
+    points : (N, dim) positions of the nodes, m
+    stiffness : k, N/m³
+    """
+    shapes, areas = facet_quadrature(points, facets)
+    sizes = np.linalg.norm(areas, axis=2, keepdims=True)
+    along = areas / np.sqrt(sizes) * np.sqrt(stiffness)
+    values = np.einsum("qm,qkx->qkmx", shapes, along)
+    columns = dofs_of(facets, points.shape[1]).reshape(1, *values.shape[1:])
+    row = np.arange(values.shape[0] * values.shape[1]).reshape(*values.shape[:2], 1, 1)
+    at = (np.broadcast_to(k, values.shape).ravel() for k in (row, columns))
+    return csr_array((values.ravel(), tuple(at)), shape=(row.size, points.size))
+
+
 def support_rows(mesh: Mesh, fixed: Nodes) -> csr_array:
     """Return B_D (m_E, n), the rows of prescribed components."""
     return csr_array(eye_array(mesh.dofs, format="csr")[fixed])
@@ -227,7 +324,10 @@ def assemble_stiffness(bodies: UnassembledBodies) -> Bodies:
     """Return the bodies with their stiffness matrix assembled."""
     data = {part.name: getattr(bodies, part.name) for part in fields(bodies)}
     D = bodies.elasticity * (bodies.length / bodies.force)
-    return Bodies(**data, K=stiffness(bodies.mesh, D, bodies.body))
+    K = stiffness(bodies.mesh, D, bodies.body)
+    if (S := bodies.springs) is not None:
+        K = csc_array(K + S.T @ S)
+    return Bodies(**data, K=K)
 
 
 def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
@@ -237,8 +337,7 @@ def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedI
         as in the paper, BK⁺Bᵀ of eq. (3) requires one solve per row of B in every load
         step
     """
-    parts = bodies.points_of_bodies
-    kernels = [rigid_modes(part) for part in parts]
+    parts, kernels = bodies.points_of_pieces, bodies.kernels
     fixing = [dofs_of(fixing_nodes(part), bodies.mesh.dim) for part in parts]
     constrained = np.union1d(bodies.interface, bodies.B_D.indices)
     interface = Interface(constrained, bodies.mesh.points) if condense else None
@@ -257,7 +356,7 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
     prescribed = bodies.B_D.indices
     # a factorisation can fail to detect a singular K, since rounding may make it
     # nonsingular
-    if np.linalg.matrix_rank(bodies.rigid[prescribed]) < bodies.rigid.shape[1]:
+    if not is_supported(bodies):
         raise InputError(
             "the supports allow a rigid motion of some body, so dual-bounds does not "
             "exist; expected form primal or dual"

@@ -22,7 +22,7 @@ from mortarbench.problems.contact.sides import (
     states,
     undetermined_friction,
 )
-from mortarbench.problems.fem.mesh import as_vectors
+from mortarbench.problems.fem.mesh import Mesh, Nodes, as_vectors
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 
 #: names of stress components in Voigt's notation
@@ -54,7 +54,9 @@ def quantities(
     stresses : nodal stresses (N,) by name; by default those of linear elasticity
     """
     l, owner = bodies.length, bodies.body_of_node
-    stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
+    if stresses is None:
+        stresses, _, owner = _stresses(bodies, s.x * l)
+    stress = stresses["von_mises"]
     bulk = BulkResults(
         nodes=len(bodies.mesh.points),
         elements=len(bodies.mesh.cells),
@@ -119,9 +121,9 @@ def _contact_force(
         return {}
     if not bodies.pairs:
         return {"contact_force": [0.0] * bodies.mesh.dim}
-    owner, (slave, master) = bodies.body_of_node, bodies.pairs[0].sides
-    # the contact forces on both bodies cancel, so only those on one body are summed
-    loaded = owner == owner[(master if master.size else slave).flat[0]]
+    slave, master = bodies.pairs[0].sides
+    # the contact forces on both bodies cancel, so only those on one side are summed
+    loaded = np.unique(master if master.size else slave)
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 
 
@@ -259,12 +261,33 @@ def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:
 
     The components are sxx, syy and sxy in 2D, with szz = ν(sxx + syy) in plane
     strain, and all six in 3D. `von_mises` is computed from the recovered components
-    instead of being recovered itself, so that all values are consistent.
+    instead of being recovered itself, so that all values are consistent. At a common
+    node of several bodies, the values of these bodies are averaged.
     """
-    stress = recover(bodies.mesh, centre_stress(bodies.mesh, bodies.D, u))
-    nu = np.array([m.nu for m in bodies.materials])[bodies.body_of_node]
+    named, node, _ = _stresses(bodies, u)
+    if bodies.piece is None:
+        return named
+    count = np.bincount(node)
+    return {name: np.bincount(node, values) / count for name, values in named.items()}
+
+
+def _stresses(bodies: Bodies, u: Vector) -> tuple[dict[str, Vector], Nodes, Nodes]:
+    """Return the stresses of each body at its nodes, these nodes, and their bodies.
+
+    A common node of several bodies, where stresses may jump, occurs once for each body.
+    """
+    mesh, owner, node = bodies.mesh, bodies.body_of_node, np.arange(u.size)
+    if bodies.piece is not None:
+        size, corners = len(mesh.points), mesh.cells.shape[1]
+        copies = bodies.body[:, None] * size + mesh.cells
+        key, cells = np.unique(copies, return_inverse=True)
+        owner, node = np.divmod(key, size)
+        mesh = Mesh(mesh.points[node], cells.reshape(-1, corners), {})
+        u = as_vectors(u, mesh.dim)[node].ravel()
+    stress = recover(mesh, centre_stress(mesh, bodies.D, u))
+    nu = np.array([m.nu for m in bodies.materials])[owner]
     names = IN_PLANE if bodies.plane else IN_SPACE
     nodal = dict(zip(names, stress.T, strict=True))
     if bodies.plane == "strain":
         nodal["szz"] = nu * (nodal["sxx"] + nodal["syy"])
-    return nodal | {"von_mises": von_mises(stress, nu, bodies.plane)}
+    return nodal | {"von_mises": von_mises(stress, nu, bodies.plane)}, node, owner

@@ -22,7 +22,7 @@ from mortarbench.problems.contact.rows import (
     handed_over,
 )
 from mortarbench.problems.contact.surface import current_surface
-from mortarbench.problems.fem.mesh import as_vectors
+from mortarbench.problems.fem.mesh import Nodes, as_vectors
 
 RIGID = "rigid"  #: name of a rigid master
 ACTIVE_THRESHOLD = 1e-6  #: a contact row is active where λ_i > ACTIVE_THRESHOLD·max λ
@@ -209,6 +209,9 @@ def bodies_of(
     bodies: UnassembledBodies | ContactSides, pair: ContactPair
 ) -> tuple[str, str]:
     """Return the names of the bodies of slave and master."""
-    owner = bodies.body_of_node
-    master = bodies.names[owner[pair.master.flat[0]]] if pair.master.size else RIGID
-    return bodies.names[owner[pair.slave.flat[0]]], master
+
+    def owner(side: Nodes) -> str:
+        """Return the body with the most nodes; end nodes may be common to several."""
+        return bodies.names[np.bincount(bodies.body_of_node[side.ravel()]).argmax()]
+
+    return owner(pair.slave), owner(pair.master) if pair.master.size else RIGID

@@ -196,10 +196,16 @@ def contact_case(
         # step
         seconds = inverse.seconds + perf_counter() - start
         matrices = _paper(transformed.qp, primal, friction, form, inverse)
-    energy = bodies.force * bodies.length
+    energy, lift = bodies.force * bodies.length, primal.A.T @ primal.b
+    has_lift = bool(lift.any())
 
     def recovered(s: Solution) -> Solution:
         return settle(transformed.recover(s))
+
+    def to_primal(s: Solution) -> Solution:
+        """Return the solution with u − w, see `Mechanics`."""
+        s = transformed.recover(s)
+        return replace(s, x=s.x - lift) if has_lift else s
 
     return Case(
         qp=transformed.qp,
@@ -219,20 +225,23 @@ def contact_case(
         dualise_seconds=seconds,
         mechanics=Mechanics(
             primal=primal,
-            to_primal=transformed.recover,
+            to_primal=to_primal,
             factorise=supported,
             mesh_size=bodies.mesh_size,
             rigid=bodies.rigid,
-            names=bodies.names,
+            # the columns of `rigid` belong to pieces only if no spring resists them
+            names=() if bodies.springs is not None else bodies.piece_names,
             scale=energy,
+            constant=energy * float(lift @ (0.5 * (primal.P @ lift) + primal.q)),
             grid=Grid(
                 bodies.mesh.points,
                 bodies.mesh.cells,
-                bodies.body,
-                np.zeros(bodies.mesh.dofs),
+                bodies.pieces[bodies.body],
+                lift,
             ),
             friction=friction,
-            certify_by_subdomains=certify_by_subdomains,
+            # subdomains are certified for supports with u = 0
+            certify_by_subdomains=None if has_lift else certify_by_subdomains,
         ),
         unsettled=friction.unsettled,
     )

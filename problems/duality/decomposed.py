@@ -18,6 +18,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array, vstack
 from mortarbench.harness import (
     QP,
     Friction,
+    InputError,
     ReferenceOverRanks,
     Solution,
     Status,
@@ -29,12 +30,19 @@ from mortarbench.problems.contact.bodies import (
     ContactPair,
     ContactSides,
     elasticity_matrices,
+    joined_names,
     slave_places,
 )
 from mortarbench.problems.contact.friction import friction_of
 from mortarbench.problems.contact.results import BulkResults, results_of
 from mortarbench.problems.contact.rows import ContactRows, without_fixed
-from mortarbench.problems.contact.stepping import Forces, LoadPath, Stage, State
+from mortarbench.problems.contact.stepping import (
+    Forces,
+    LoadPath,
+    Stage,
+    State,
+    forces_of,
+)
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
@@ -124,6 +132,11 @@ def decomposed_path(
 
     reference : solver of a distributed dual; all ranks call it together
     """
+    if problem.bodies.lift is not None:
+        raise InputError(
+            "prescribed displacements on MPI ranks are not built; expected no ranks, "
+            "or supports without displacement"
+        )
     layout, elastic = cached_layout(problem.bodies, choice.size), problem.bodies
     previous = list[LocalDual]()
 
@@ -191,22 +204,38 @@ def decompose(
     contact: Contact,
     cluster: int = 0,
 ) -> DecomposedProblem:
-    """Return the decomposed problem of elastic bodies under the load of a `Stage`."""
-    unit = bodies.length / bodies.force
+    """Return the decomposed problem of elastic bodies under the load of a `Stage`.
+
+    Raises
+    ------
+    InputError
+        If the bodies have springs.
+
+    """
+    if bodies.springs is not None:
+        raise InputError(
+            "springs on bodies in parts are not built; expected no parts, or no springs"
+        )
+    unit, pieces = bodies.length / bodies.force, bodies.piece
     D = elasticity_matrices(bodies.materials, bodies.plane) * unit
     E = np.array([m.E for m in bodies.materials]) * unit
     share = longitudinal_share(D)
     load = stage.forces._replace(value=stage.forces.value * stage.part)
+    lift = None
+    if bodies.lift is not None:
+        lift = force_lookup(forces_of(bodies.lift * stage.part))
     return DecomposedProblem(
         layout=layout,
         components=bodies.shape.dim,
         material=layout.body,
         assemble_class=partial(elastic_class, D=D, E=E),
         E=E,
-        names=bodies.names,
+        names=bodies.names if pieces is None else joined_names(bodies.names, pieces),
+        piece=pieces,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
         fixed=stage.fixed,
         load=force_lookup(load),
+        lift=lift,
         glue=glue,
         contact=contact,
         cluster=cluster,
@@ -469,13 +498,14 @@ class _Patch(NamedTuple):
 def _with_layers(layout: Subdivision, subdomains: Nodes, layers: int) -> _Patch:
     """Return subdomains of one body with layers of neighbouring cells."""
     inside = np.unique(layout.subdomain_nodes(subdomains).number)
-    included = (
-        np.union1d(subdomains, _holders(layout, inside)) if layers else subdomains
-    )
+    body = int(layout.body[subdomains[0]])
+    included = subdomains
+    if layers:
+        included = np.union1d(subdomains, _holders(layout, inside, body))
     nodes, cells = _cells_of(layout, included)
     reached, selected = inside, np.ones(len(cells), dtype=bool)
     for _ in range(layers):
-        neighbours = np.setdiff1d(_holders(layout, reached), included)
+        neighbours = np.setdiff1d(_holders(layout, reached, body), included)
         if neighbours.size:
             included = np.concatenate([included, neighbours])
             nodes, cells = _cells_of(layout, included)
@@ -499,13 +529,14 @@ def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
     return nodes, np.concatenate(cells)
 
 
-def _holders(layout: Subdivision, node: Nodes) -> Nodes:
-    """Return the subdomains that contain any of the interface nodes among `node`."""
+def _holders(layout: Subdivision, node: Nodes, body: int) -> Nodes:
+    """Return the subdomains of a body that contain interface nodes among `node`."""
     multiplicity = layout.multiplicity(node)
     several = multiplicity > 1
     copies = range(int(multiplicity.max(initial=1)))
     holders = [layout.holder(node[several & (multiplicity > c)], c) for c in copies]
-    return np.unique(np.concatenate(holders))
+    found = np.unique(np.concatenate(holders))
+    return np.asarray(found[layout.body[found] == body])
 
 
 def _max_von_mises(

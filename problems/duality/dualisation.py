@@ -118,41 +118,43 @@ def dual_bounds(
     ::
 
         min ½λᵀFλ − dᵀλ   subject to   λ ≥ 0,  RᵀB_Iᵀλ = Rᵀf
-        F = B_I K⁺B_Iᵀ,  d = B_I K⁺f − c_I
+        F = B_I K⁺B_Iᵀ,  d = B_I u_0 − c_I,  u_0 = w + K⁺(f − Kw)
 
-    The equations state equilibrium with respect to the rigid motions R that the
-    supports allow; if the supports exclude all rigid motions, there are no equations.
-    The inverse map is  u = K⁺(f − B_Iᵀλ) − Rα  as in `dualise`. The multipliers of the
-    supports (reactions) follow from stationarity.
+    where w contains the prescribed displacements and zeros. The equations state
+    equilibrium with respect to the rigid motions R that the supports allow; if the
+    supports exclude all rigid motions, there are no equations. The inverse map is
+    u = w + K⁺(f − Kw − B_Iᵀλ) − Rα  as in `dualise`. The multipliers of the supports
+    (reactions) follow from stationarity. At the solutions,
+    ½uᵀKu − fᵀu = −(½λᵀFλ − dᵀλ) + ½wᵀ(Ku_0 − f) − ½fᵀu_0.
 
     Parameters
     ----------
-    primal : QP whose equality rows are unit vectors with zero right-hand side
+    primal : QP whose equality rows are unit vectors
     clamped : K⁺ that is zero at the components these rows fix, with an orthonormal
         basis R of the rigid motions that are zero there
-    free : K⁺f (n,); None if not computed yet
+    free : u_0 (n,); None if not computed yet
     friction : law with a prescribed bound; its rows follow the contact rows
 
     """
-    f = -primal.q
+    f, lift = -primal.q, primal.A.T @ primal.b
+    pushed = f - primal.P @ lift
     B, c = contact_rows(primal, friction)
-    free = clamped(f) if free is None else free
+    free = lift + clamped(pushed) if free is None else free
     fixed = np.unique(csr_array(primal.A).indices).astype(np.int64)
     structure = Structure(K=primal.P, B=B, fixed=fixed)
     sets = multiplier_sets(0, primal.h.size, friction.bound, friction.tangents)
     qp = _dual(structure, c, clamped, f, free, sets)
 
     def recover(s: Solution) -> Solution:
-        u = _without_motion(clamped(f - B.T @ s.x), clamped, s)
+        u = lift + _without_motion(clamped(pushed - B.T @ s.x), clamped, s)
         reactions = -primal.A @ (primal.P @ u - f + B.T @ s.x)
         return replace(s, x=u, y=reactions, z=s.x, z_box=np.zeros(u.size))
 
     def interface_displacement(s: Solution) -> Vector:
         return _without_motion(free - clamped.at_constraints(B.T @ s.x), clamped, s)
 
-    return Transformed(
-        qp, recover, -1.0, -0.5 * float(f @ free), interface_displacement
-    )
+    constant = 0.5 * float(lift @ (primal.P @ free - f)) - 0.5 * float(f @ free)
+    return Transformed(qp, recover, -1.0, constant, interface_displacement)
 
 
 def with_friction_bound(dual: QP, friction: Friction) -> QP:

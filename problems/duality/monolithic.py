@@ -230,7 +230,7 @@ def _path(
         @cache
         def dual() -> Transformed:
             if load not in free:
-                free[load] = inverse(stage)(loaded.f)
+                free[load] = _unconstrained(loaded, inverse(stage))
             return transform(primal, inverse(stage), free[load] * stage.part, first)
 
         return MonolithicLinearisation(
@@ -243,18 +243,27 @@ def _path(
     )
 
 
+def _unconstrained(bodies: Bodies, inverse: GeneralisedInverse) -> Vector:
+    """Return the displacement (n,) under the full load without contact."""
+    if bodies.lift is None:
+        return inverse(bodies.f)
+    return bodies.lift + inverse(bodies.f - bodies.K @ bodies.lift)
+
+
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
     """Return the nondimensional primal QP, equation (1) of the paper.
 
-    The QP minimises ½uᵀKu − fᵀu subject to B_D u = 0 and B_M u ≤ c_M, where f is the
-    load of `bodies` times `load_factor`.
+    The QP minimises ½uᵀKu − fᵀu subject to B_D u = B_D w and B_M u ≤ c_M, where f and w
+    are the load and the prescribed displacements of `bodies` times `load_factor`.
     """
-    n = bodies.mesh.dofs
+    n, m = bodies.B_D.shape[::-1]
     return QP(
         P=bodies.K,
         q=-load_factor * bodies.f,
         A=bodies.B_D,
-        b=np.zeros(bodies.B_D.shape[0]),
+        b=np.zeros(m)
+        if bodies.lift is None
+        else bodies.B_D @ bodies.lift * load_factor,
         G=rows.B,
         h=rows.c / bodies.length,
         lb=np.full(n, -np.inf),

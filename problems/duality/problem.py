@@ -14,6 +14,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Friction, InputError, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import (
@@ -25,6 +26,7 @@ from mortarbench.problems.contact.bodies import (
     factorise_clamped,
     factorise_floating,
     factorise_supported,
+    is_supported,
     support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
@@ -223,9 +225,12 @@ class ElasticBodies:
     plane: Plane | None  #: plane state; None in 3D
     length: float  #: l, unit of length of the QPs, m
     force: float  #: F₀, unit of force of the QPs: N/m in 2D, N in 3D
-    fixed: Nodes  #: displacement components that are prescribed as zero
+    fixed: Nodes  #: displacement components that are prescribed
     forces: Forces  #: full load
     pairs: tuple[ContactPair, ...]
+    piece: NDArray[np.int64] | None = None  #: see `UnassembledBodies`
+    lift: Vector | None = None  #: see `UnassembledBodies`
+    springs: csr_array | None = None  #: see `UnassembledBodies`
 
     @cached_property
     def assembled(self) -> Bodies:
@@ -249,13 +254,15 @@ class ElasticBodies:
             f=f,
             B_D=support_rows(mesh, self.fixed),
             pairs=self.pairs,
+            piece=self.piece,
+            lift=self.lift,
+            springs=self.springs,
         )
 
     @cached_property
     def is_supported(self) -> bool:
         """True if the supports exclude all rigid motions of every body."""
-        rigid = self.whole.rigid
-        return bool(np.linalg.matrix_rank(rigid[self.fixed]) == rigid.shape[1])
+        return is_supported(self.whole)
 
     @cached_property
     def floating(self) -> GeneralisedInverse:
@@ -294,6 +301,9 @@ def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
         fixed=fixed,
         forces=forces_of(bodies.f),
         pairs=bodies.pairs,
+        piece=bodies.piece,
+        lift=bodies.lift,
+        springs=bodies.springs,
     )
     vars(result)["whole"] = bodies
     if isinstance(bodies, Bodies):

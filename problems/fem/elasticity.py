@@ -97,6 +97,25 @@ def strain_matrix(gradients: Floats) -> Floats:
     return B
 
 
+def nodal_masses(mesh: Mesh, density: Vector) -> Vector:
+    """Return ∫ρN_j dV of the shape functions, (N,): kg in 3D, kg per m of thickness.
+
+    density : ρ (E,) of each cell, kg/m³
+    """
+    masses = np.zeros(len(mesh.points))
+    # a degenerate quadrilateral is a triangle, but a degenerate hexahedron is not exact
+    cells = [(mesh.cells, density)]
+    if mesh.dim == 3:
+        cells = [(block.nodes, density[block.cells]) for block in mesh.blocks]
+    for nodes, rho in cells:
+        element = ELEMENTS[mesh.dim, nodes.shape[1]]
+        for xi, weight in zip(element.points, element.weights, strict=True):
+            _, volume = shape_gradients(mesh.points[nodes], xi)
+            mass = (weight * rho * volume)[:, None] * element.shapes(xi)
+            np.add.at(masses, nodes, mass)
+    return masses
+
+
 def stiffness(
     mesh: Mesh,
     D: NDArray[np.float64],

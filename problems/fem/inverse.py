@@ -198,7 +198,8 @@ def supported_inverse(
 
     """
     fixed = np.setdiff1d(np.arange(K.shape[0]), free)
-    kernel = rigid @ null_space(rigid[fixed]) if fixed.size else rigid
+    can_move = fixed.size and rigid.shape[1]
+    kernel = rigid @ null_space(rigid[fixed]) if can_move else rigid
     if not kernel.shape[1]:
         return _inverse(csc_array(K), free, kernel, interface)
     kernel[fixed] = 0  # null_space returns zeros only up to rounding

@@ -467,6 +467,28 @@ def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
     return np.asarray(np.append(half, 0) + np.append(0, half))
 
 
+def facet_quadrature(
+    points: NDArray[np.float64], facets: Nodes
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return shape functions (q, m) and area vectors (q, k, dim) at Gauss points.
+
+    The area vector is the outward normal, multiplied by the weight of the point and by
+    the measure of the facet: a length in m in 2D, and an area in m² in 3D.
+
+    facets : (k, m) edges (m = 2) or faces (m = 4) of a boundary
+    """
+    if points.shape[1] == 2:
+        xi = np.array([-1.0, 1.0]) / np.sqrt(3)
+        x, y = np.diff(points[facets], axis=1)[:, 0].T
+        normals = np.stack([y, -x], axis=1) / 2
+        return np.stack([1 - xi, 1 + xi], axis=1) / 2, np.stack([normals] * 2)
+    areas = [
+        weight * np.cross(*np.einsum("ar,fax->rfx", QUAD.gradients(xi), points[facets]))
+        for xi, weight in zip(QUAD.points, QUAD.weights, strict=True)
+    ]
+    return np.stack([QUAD.shapes(xi) for xi in QUAD.points]), np.stack(areas)
+
+
 def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vector]:
     """Return the nodes of `faces` (k, 4), ascending, and their areas ∫N_j dA, m².
 
@@ -476,12 +498,11 @@ def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vecto
     ([4, 5, 6, 7], [0.25, 0.25, 0.25, 0.25])
     """
     nodes, place = np.unique(faces, return_inverse=True)
-    areas, place = np.zeros(nodes.size), place.reshape(faces.shape)
-    for xi, weight in zip(QUAD.points, QUAD.weights, strict=True):
-        tangents = np.einsum("ar,fax->rfx", QUAD.gradients(xi), points[faces])
-        measure = np.linalg.norm(np.cross(*tangents), axis=1)
-        np.add.at(areas, place, weight * measure[:, None] * QUAD.shapes(xi))
-    return nodes, areas
+    shapes, areas = facet_quadrature(points, faces)
+    shares = np.einsum("qm,qk->km", shapes, np.linalg.norm(areas, axis=2))
+    total = np.zeros(nodes.size)
+    np.add.at(total, place.reshape(faces.shape), shares)
+    return nodes, total
 
 
 def nodes_of_side(side: Nodes) -> Nodes:

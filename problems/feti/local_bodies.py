@@ -189,10 +189,10 @@ def _force_rows(problem: DecomposedProblem) -> Nodes:
 
 
 def floating_bodies(problem: DecomposedProblem) -> list[int]:
-    """Return the indices of the bodies that the supports allow to move rigidly."""
+    """Return the indices of the pieces that the supports allow to move rigidly."""
     layout, d = problem.layout, problem.components
     node, axis = np.divmod(problem.fixed, d)
-    body = layout.body[layout.holder(node)]
+    body = problem.piece_of[layout.holder(node)]
 
     def is_supported(b: int) -> bool:
         fixed = body == b
@@ -203,7 +203,7 @@ def floating_bodies(problem: DecomposedProblem) -> list[int]:
         motions = _motions((points - points[0]) / size, axis[fixed], d)
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
-    return [b for b in range(problem.E.size) if not is_supported(b)]
+    return [b for b in range(int(problem.piece_of.max()) + 1) if not is_supported(b)]
 
 
 def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
@@ -256,9 +256,9 @@ def _floating_bodies(local: LocalSubdomains) -> FloatingBodies:
             motions=motions[0], combinations=np.zeros((0, 0)), names=()
         )
     points = np.concatenate([*layout.points(local.number)])
-    body = layout.body[local.number][local.nodes.subdomain]
+    body = problem.piece_of[local.number][local.nodes.subdomain]
     fixed, axis = np.divmod(problem.fixed, d)
-    body_fixed = layout.body[layout.holder(fixed)]
+    body_fixed = problem.piece_of[layout.holder(fixed)]
     for b in numbers:
         extent = _extent(
             local, points, np.where(body == b, 1 / local.nodes.multiplicity, 0.0)

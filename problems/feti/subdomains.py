@@ -120,13 +120,19 @@ class DecomposedProblem:
     #: function that assembles the class of a floating subdomain
     assemble_class: Callable[[SubdomainMesh], SubdomainClass]
     E: Vector  #: (bodies,) moduli for the scaling of rows
-    names: tuple[str, ...]  #: names of the bodies
+    names: tuple[str, ...]  #: names of the pieces
+    #: (bodies,) piece of each body; bodies of a piece have common nodes. None: every
+    #: body is a piece
+    piece: Integers | None = None
     #: map from numbers of subdomains to a function that evaluates the factors of E at
     #: their torn nodes, see `problems.feti.structured.Layout.shaping`; None if all
     #: factors are 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
     load: Callable[[Nodes], Vector]  #: map from global components (k,) to forces (k,)
-    fixed: Nodes  #: global components prescribed as zero, in the order of their rows
+    fixed: Nodes  #: prescribed global components, in the order of their rows
+    #: map from global components (k,) to prescribed displacements, or zero elsewhere;
+    #: None: all are zero
+    lift: Callable[[Nodes], Vector] | None = None
     #: True to eliminate fixed components, as in FETI-1 (Farhat and Roux 1991), instead
     #: of adding rows to B. Subdomains with supports then do not float and keep the
     #: global axes
@@ -134,6 +140,12 @@ class DecomposedProblem:
     contact: Contact
     glue: str  #: name of the gluing, one of `GLUE`
     cluster: int = 0  #: number of subdomains per side of a cluster; 0: no clusters
+
+    @property
+    def piece_of(self) -> Integers:
+        """Piece of each subdomain, (S,)."""
+        body = self.layout.body
+        return body if self.piece is None else self.piece[body]
 
     @property
     def redundant(self) -> bool:
@@ -674,7 +686,7 @@ def _columns(faces: Mapping[bytes, tuple[int, Dense]], n: int, d: int) -> csr_ar
 
 def _local_rows(local: LocalSubdomains) -> _Rows:
     """Assemble the local rows of B, in the order of supports, gluing and contact."""
-    problem, ranks = local.problem, local.ranks
+    problem, ranks, d = local.problem, local.ranks, local.problem.components
     entries = [_gluing_rows(local), _contact_rows(local)]
     if not problem.eliminated:
         entries.insert(0, _support_rows(local))
@@ -705,6 +717,10 @@ def _local_rows(local: LocalSubdomains) -> _Rows:
     touching = number >= E
     c = np.zeros(number.size)
     c[touching] = (scale * contact.c)[number[touching] - E]
+    if problem.lift is not None:
+        supports = number < int(problem.layout.multiplicity(problem.fixed // d).sum())
+        moved = local.spread @ problem.lift(local.components)
+        c[supports] = (B @ moved)[supports]
     group = number.copy()
     group[touching] = E + contact.groups[number[touching] - E]
     return _Rows(

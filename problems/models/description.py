@@ -11,22 +11,29 @@
     relin = 1                  # linearisations of the contact per step
     kinematics = "linear"      # or "finite": finite strain, with Newton's method
     material = "neo-hooke"     # for finite strain; or "svk", St. Venant-Kirchhoff
+    gravity = [0.0, -9.81]     # m/s²; every body then needs a density
     units = { length = 2.0, force = 1e8 }   # m, N/m: scales of the QP, see below
 
     [[bodies]]                 # one entry per physical surface
     name = "beam"
     E = 200e9                  # Pa
     nu = 0.3
+    density = 7850.0           # kg/m³
 
     [[supports]]
     boundary = "left"          # a physical curve; or point = a physical point
-    fix = ["x", "y"]           # the components of the displacement that are zero
+    fix = ["x", "y"]           # the components of the displacement that are zero; or
+                               # "all", or "normal" on a boundary normal to an axis
+    # or displacement = [1e-3, "free"]: prescribed components, m
+    # or spring = 1e9: stiffness along the normal, N/m³
 
     [[loads]]
     boundary = "top"
     traction = [0.0, -1e6]     # Pa, that is N per m of boundary and m of thickness;
                                # or force = [0, -1e6]: total in N per m of thickness,
                                # spread evenly over the boundary. Points require force
+    # or pressure = 1e6: Pa, along the normal, positive into the body
+
     [[contacts]]
     slave = "arc"              # side whose nodes must not enter the master
     master = "bottom"
@@ -34,6 +41,8 @@
     mu = 0.3
     reach = 0.1                # m, largest distance from the master at which a slave
                                # node has a contact row; optional, see below
+    adjust = 1e-5              # m: slave nodes within this distance of the master are
+                               # moved onto it, without stress
 
     [[contacts]]
     slave = "foot"             # side against a rigid body, whose lengths are in m:
@@ -42,8 +51,9 @@
     # { shape = "cylinder", centre = [0, 0, -1], axis = [0, 1, 0], radius = 0.5 } or
     # { shape = "sphere", centre = [0, 0, -1], radius = 0.5 }
 
-This file and all results are in SI units, irrespective of the length unit of the mesh:
-E and tractions in Pa, forces in N/m, units.length and rigid bodies in m.
+This file and all results are in SI units (m, N, Pa, kg, s); `length_unit` converts the
+coordinates in the mesh file only. Loads, gravity and prescribed displacements grow in
+`steps` equal steps. Normals are those of the mesh as it is read.
 
 Rigid bodies do not move. The normal of a plane points towards the slave; normals and
 axes may have any length. The centre of a cylinder is any point on its axis. Contact
@@ -64,35 +74,41 @@ is distributed uniformly over its area; `point` is a physical point or curve, wh
 nodes share a force equally. Finite strain and ``plane = "stress"`` are not available
 for volumes.
 
-The keys from length_unit to units are optional. The values above are their defaults,
-except for units: the default of units.length is the longest side of the bounding box of
-the mesh, and that of units.force is the sum of |load| over the nodes. Bodies supported
-by contact alone have no form dual-bounds. If neither supports nor friction prevent a
-rigid motion along the contacts, linear kinematics require ``steps = 1`` and ``relin =
-1``. A pair that sets no friction law has the law of the top-level keys friction, bound
-and mu, whose default is no friction. With the top-level key ``loading = "static"``,
-slip is measured from the undeformed state.
+Loads and supports may be missing if other entries, or contact sides that overlap,
+stress the bodies. The keys from length_unit to units are optional. The values above are
+their defaults, except for gravity (none) and units: the default of units.length is the
+longest side of the bounding box of the mesh, and that of units.force is the sum of
+|load| over the nodes, or without loads the force at a strain of 0.1 % in the softest
+body. Bodies supported by contact alone have no form dual-bounds. If neither supports
+nor friction prevent a rigid motion along the contacts, linear kinematics require
+``steps = 1`` and ``relin = 1``. A pair that sets no friction law has the law of the
+top-level keys friction, bound and mu, whose default is no friction. With the top-level
+key ``loading = "static"``, slip is measured from the undeformed state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, vstack
 
-from mortarbench.harness import InputError, checked
+from mortarbench.harness import InputError, Vector, checked
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import shown, unknown
 from mortarbench.harness.files.reading import read_toml
 from mortarbench.problems.contact.bodies import (
     ContactPair,
+    ContactSides,
     UnassembledBodies,
+    spring_rows,
     support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
+from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.rigid import (
     RigidBody,
     RigidCylinder,
@@ -100,12 +116,13 @@ from mortarbench.problems.contact.rigid import (
     RigidSphere,
 )
 from mortarbench.problems.contact.surface import current_surface
-from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_areas
+from mortarbench.problems.fem.elasticity import Material, nodal_masses
+from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, facet_quadrature
 from mortarbench.problems.fem.mesh_files.named import (
     FileMesh,
     NamedMesh,
     named_mesh,
+    oriented,
     refine,
 )
 from mortarbench.problems.fem.mesh_files.reading import read_mesh_file
@@ -123,7 +140,13 @@ from mortarbench.problems.ranges import (
 
 _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
-_LOADS = ("force", "traction")
+_LOADS = ("force", "traction", "pressure")
+_SUPPORTS = ("fix", "displacement", "spring")
+#: largest angle in rad between normals of a plane boundary; positive, because
+#: coordinates may be rounded
+MAX_TILT = 1e-6
+#: strain that defines the unit of force of problems without loads
+UNIT_STRAIN = 1e-3
 _AXES = ("x", "y", "z")
 #: mapping from the dimension to the keys of each shape of rigid bodies; all keys except
 #: radius are vectors
@@ -153,6 +176,7 @@ _KEYS = (
     "mesh",
     "length_unit",
     *SETTINGS,
+    "gravity",
     "units",
     "bodies",
     "supports",
@@ -173,7 +197,7 @@ def read_description(path: Path) -> dict[str, Any]:
     table = read_toml(path)
     with located(str(path)):
         checked.only_keys(table, _KEYS)
-        for key in ("mesh", "bodies", "supports", "loads", "contacts"):
+        for key in ("mesh", "bodies", "contacts"):
             if key not in table:
                 raise InputError(f"{key} is missing")
         checked.text("mesh", table["mesh"])
@@ -207,8 +231,8 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     mesh_path = path.parent / table["mesh"]
     file = read_mesh_file(mesh_path)
     with located(str(path)):
-        materials = _materials(table["bodies"], file)
-    named = named_mesh(file, {file.set_of(name) for name in materials})
+        described = _described(table["bodies"], file)
+    named = named_mesh(file, {file.set_of(name) for name in described})
     if named.dim == 3 and halvings:
         raise InputError(
             f"{mesh_path}: halvings={halvings} with volumes is not built; expected "
@@ -220,31 +244,46 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
         named = refine(named)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
-    with located(str(path)):
-        materials = {name: _material_of(materials, name, file) for name in named.surfaces}
-        fixed = _each(table, "supports", lambda entry: _support(entry, named))
-        loads = _each(table, "loads", lambda entry: _load(entry, named))
-        held = np.unique(np.concatenate(fixed))
-        _check_loads_act(table["loads"], loads, held)
-        pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
-        _check_unique(table["contacts"])
-        load: NDArray[np.float64] = np.sum(loads, axis=0)
-        length, force = _units(table.get("units", {}), named, load)
     body = np.repeat(
         np.arange(len(named.surfaces)), [len(c) for c in named.surfaces.values()]
     )
+    with located(str(path)):
+        entries = [_entry_of(described, name, file) for name in named.surfaces]
+        supports = _each(table, "supports", lambda entry: _support(entry, named))
+        held, moved = _prescribed(supports)
+        pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
+        _check_unique(table["contacts"])
+        named = _adjusted(table["contacts"], pairs, named)
+        loads = _each(table, "loads", lambda entry: _load(entry, named))
+        _check_loads_act(table.get("loads", []), loads, held)
+        load: NDArray[np.float64] = np.sum(loads, axis=0) + np.zeros_like(named.points)
+        load = load + _weight(table, entries, named, body)
+        softest = min(entry["E"] for entry in entries)
+        length, force = _units(table.get("units", {}), named, load, softest)
     mesh = Mesh(named.points, named.cells, {})
+    lift = np.zeros(mesh.dofs)
+    lift[held] = moved / length
+    springs = [
+        spring_rows(named.points, support.facets, support.spring)
+        for support in supports
+        if support.spring
+    ]
     return UnassembledBodies(
         mesh=mesh,
         body=body,
         names=tuple(named.surfaces),
-        materials=tuple(materials[name] for name in named.surfaces),
+        materials=tuple(Material(entry["E"], entry["nu"]) for entry in entries),
         plane=plane if named.dim == 2 else None,
         length=length,
         force=force,
         f=load.ravel() / force,
         pairs=tuple(pairs),
         B_D=support_rows(mesh, held),
+        piece=named.piece if np.bincount(named.piece).max() > 1 else None,
+        lift=lift if lift.any() else None,
+        springs=csr_array(vstack(springs)) * np.sqrt(length / force)
+        if springs
+        else None,
     )
 
 
@@ -277,76 +316,170 @@ def _each(
 ) -> list[Any]:
     """Apply `read` to every table of a list; errors state the index of the entry."""
     values = []
-    for i, entry in enumerate(checked.filled_list(key, table[key])):
+    for i, entry in enumerate(checked.any_list(key, table.get(key, []))):
         with located(f"{key}[{i}]"):
             values.append(read(checked.table("entry", entry)))
     return values
 
 
-def _materials(entries: object, file: FileMesh) -> dict[str, Material]:
-    materials: dict[str, Material] = {}
+def _described(entries: object, file: FileMesh) -> dict[str, dict[str, float]]:
+    """Return E, nu and, where given, density by the names of bodies or their sets."""
+    described: dict[str, dict[str, float]] = {}
 
     def read(entry: dict[str, Any]) -> None:
-        _keys(entry, ("name", "E", "nu"))
+        checked.only_keys(entry, ("name", "E", "nu", "density"))
+        _required(entry, ("name", "E", "nu"))
         name = checked.text("name", entry["name"])
-        _check_known(file.words.body, file.set_of(name), file.body_names)
-        if name in materials:
+        if file.set_of(name) not in file.body_names:
+            raise unknown(file.words.body, name, file.body_names, where="name")
+        if name in described:
             raise InputError(f"body {name!r} is described twice; expected once")
-        E, nu = physical("E", checked.positive("E", entry["E"])), entry["nu"]
+        nu = entry["nu"]
         if not checked.is_number(nu) or not -1 < nu < 0.5:
             raise InputError(f"nu = {shown(nu)}; expected a number between -1 and 0.5")
-        materials[name] = Material(E=E, nu=float(nu))
+        described[name] = {"nu": float(nu)}
+        for key in ("E", "density"):
+            if key in entry:
+                value = physical(key, checked.positive(key, entry[key]))
+                described[name][key] = value
 
-    _each({"bodies": entries}, "bodies", read)
-    return materials
+    _each({"bodies": checked.filled_list("bodies", entries)}, "bodies", read)
+    return described
 
 
-def _material_of(
-    materials: Mapping[str, Material], body: str, file: FileMesh
-) -> Material:
-    """Return the material of a body, described by its name or that of its set."""
+def _entry_of(
+    described: Mapping[str, dict[str, float]], body: str, file: FileMesh
+) -> dict[str, float]:
+    """Return the entry of a body, which may have the name of the body or of its set."""
     for name in (body, file.set_of(body)):
-        if name in materials:
-            return materials[name]
+        if name in described:
+            return described[name]
     raise InputError(f"bodies: {file.words.body} {body!r} has no entry")
 
 
-def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
-    """Return the displacement components fixed by a support."""
-    checked.only_keys(entry, (*_PLACES, "fix"))
-    nodes, _ = _place(entry, named, ("fix",))
-    fix = checked.filled_list("fix", entry["fix"])
-    axes = _AXES[: named.dim]
-    for component in fix:
-        if component not in axes:
-            raise unknown("component", checked.text("fix", component), axes)
-    return np.concatenate([dofs_of(nodes, named.dim, axes.index(c)) for c in fix])
+class _Support(NamedTuple):
+    """Effect of a support."""
+
+    component: Nodes  #: (k,) prescribed components
+    value: Vector  #: (k,) their displacements, m
+    facets: Nodes  #: facets of the boundary with springs
+    spring: float = 0.0  #: stiffness of the springs, N/m³; 0: no springs
+
+
+def _support(entry: dict[str, Any], named: NamedMesh) -> _Support:
+    """Return the displacement components that a support prescribes, or its springs."""
+    kind, nodes, facets = _place(entry, named, _SUPPORTS)
+    value, dim, axes = entry[kind], named.dim, _AXES[: named.dim]
+    if kind == "spring":
+        stiffness = physical("spring", checked.positive("spring", value))
+        return _Support(nodes[:0], np.zeros(0), _filled(facets, kind), stiffness)
+    if kind == "displacement":
+        free = [x in ("free", "null") for x in checked.filled_list(kind, value)]
+        vector = _vector(
+            kind, [0.0 if f else x for f, x in zip(free, value, strict=True)], dim
+        )
+        prescribed = {k: x for k, x in enumerate(vector) if not free[k]}
+        if not prescribed:
+            raise InputError("displacement: all components are free; expected a number")
+    elif value == "normal":
+        areas = facet_quadrature(named.points, _filled(facets, kind))[1]
+        normals = areas / np.linalg.norm(areas, axis=2, keepdims=True)
+        tilt = 1 - np.abs(normals).min(axis=(0, 1))
+        if tilt.min() > MAX_TILT**2:
+            raise InputError(
+                'fix = "normal" on a boundary that is not normal to an axis is not '
+                "built; expected a plane boundary along the axes, a stiff spring, or "
+                f"fix = {list(axes)}"
+            )
+        prescribed = {int(tilt.argmin()): 0.0}
+    else:
+        fix = axes if value == "all" else checked.filled_list(kind, value)
+        for component in fix:
+            if component not in axes:
+                raise unknown(
+                    "component", checked.text(kind, component), (*axes, "all", "normal")
+                )
+        prescribed = {axes.index(component): 0.0 for component in fix}
+    components = [dofs_of(nodes, dim, k) for k in prescribed]
+    values = np.repeat(list(prescribed.values()), nodes.size)
+    return _Support(np.concatenate(components), values, facets)
+
+
+def _filled(facets: Nodes, key: str) -> Nodes:
+    """Return facets; raise InputError if there are none, since the place is a point."""
+    if not facets.size:
+        raise InputError(
+            f"{key} acts on a point; expected {key} on a boundary, or a force or other "
+            "fixed components"
+        )
+    return facets
+
+
+def _prescribed(supports: Sequence[_Support]) -> tuple[Nodes, Vector]:
+    """Return the prescribed components (k,), ascending, and their displacements, m.
+
+    Raises
+    ------
+    InputError
+        If two supports prescribe different displacements of a component.
+
+    """
+    none = _Support(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=int))
+    component, value = (
+        np.concatenate([getattr(support, key) for support in (none, *supports)])
+        for key in ("component", "value")
+    )
+    held, first, place = np.unique(component, return_index=True, return_inverse=True)
+    if (differs := value != value[first][place]).any():
+        k = int(differs.argmax())
+        ends = np.cumsum([support.component.size for support in supports])
+        raise InputError(
+            f"supports[{int(np.searchsorted(ends, k, side='right'))}] prescribes "
+            f"{value[k]:g} m for a component for which another support prescribes "
+            f"{value[first][place][k]:g} m; expected one displacement per component"
+        )
+    return held, value[first]
 
 
 def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     """Return the nodal forces (N, dim) of a load: N/m in 2D, N in 3D."""
-    checked.only_keys(entry, (*_PLACES, *_LOADS))
-    kinds = [kind for kind in _LOADS if kind in entry]
-    if len(kinds) != 1:
-        form = ", ".join(_AXES[: named.dim])
-        raise InputError(f"expected either force or traction = [{form}]")
-    vector = _vector(kinds[0], entry[kinds[0]], named.dim)
-    nodes, facets = _place(entry, named, tuple(kinds))
+    kind, nodes, facets = _place(entry, named, _LOADS)
+    force = np.zeros_like(named.points)
+    if kind == "pressure":
+        if not checked.is_number(value := entry[kind]):
+            raise InputError(f"pressure = {shown(value)}; expected a number, Pa")
+        shapes, areas = facet_quadrature(named.points, _filled(facets, kind))
+        pressure = physical(kind, value)
+        np.add.at(force, facets, -pressure * np.einsum("qm,qkx->kmx", shapes, areas))
+        return force
+    vector = _vector(kind, entry[kind], named.dim)
     weights = np.zeros(len(named.points))
-    if facets.size and named.dim == 3:  # ∫N_j over the boundary, m²
-        nodes, weights[nodes] = nodal_areas(named.points, facets)
-    elif facets.size:  # ∫N_j in 2D, m
-        lengths = np.linalg.norm(np.diff(named.points[facets], axis=1)[:, 0], axis=1)
-        np.add.at(weights, facets, lengths[:, None] / 2)
-    elif kinds == ["traction"]:
-        raise InputError(
-            "traction acts on a point; expected traction on a boundary, or a force"
-        )
+    if kind == "traction" or facets.size:  # ∫N_j over the boundary: m in 2D, m² in 3D
+        shapes, areas = facet_quadrature(named.points, _filled(facets, kind))
+        sizes = np.linalg.norm(areas, axis=2)
+        np.add.at(weights, facets, np.einsum("qm,qk->km", shapes, sizes))
     else:
         weights[nodes] = 1.0
-    if kinds == ["force"]:
+    if kind == "force":
         weights /= weights.sum()
     return np.outer(weights, vector)
+
+
+def _weight(
+    table: Mapping[str, Any],
+    entries: Sequence[Mapping[str, float]],
+    named: NamedMesh,
+    body: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return the nodal forces (N, dim) of gravity."""
+    if "gravity" not in table:
+        return np.zeros_like(named.points)
+    for name, entry in zip(named.surfaces, entries, strict=True):
+        if "density" not in entry:
+            raise InputError(f"bodies: {name!r} has no density, which gravity needs")
+    density = np.array([entry["density"] for entry in entries])[body]
+    masses = nodal_masses(Mesh(named.points, named.cells, {}), density)
+    return np.outer(masses, _vector("gravity", table["gravity"], named.dim))
 
 
 def _vector(key: str, value: object, dim: int) -> list[float]:
@@ -431,7 +564,9 @@ def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
 
 def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
     """Return the contact pair that an entry describes."""
-    checked.only_keys(entry, (*_SIDES, "rigid", "reach", "friction", *LAW_PARAMETERS))
+    checked.only_keys(
+        entry, (*_SIDES, "rigid", "reach", "adjust", "friction", *LAW_PARAMETERS)
+    )
     if ("master" in entry) == ("rigid" in entry):
         raise InputError(f"expected either master (a {named.words.boundary}) or rigid")
     names = [side for side in _SIDES if side in entry]
@@ -454,6 +589,43 @@ def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
             "slave and master share nodes; expected sides without common nodes"
         )
     return ContactPair(slave, sides["master"], reach=reach)
+
+
+def _adjusted(
+    entries: Sequence[Mapping[str, Any]], pairs: Sequence[ContactPair], named: NamedMesh
+) -> NamedMesh:
+    """Move slave nodes onto their masters, if they are within `adjust`.
+
+    Raises
+    ------
+    InputError
+        If a cell folds.
+
+    """
+    points, dim = named.points.copy(), named.dim
+    for i, (entry, pair) in enumerate(zip(entries, pairs, strict=True)):
+        if "adjust" not in entry:
+            continue
+        with located(f"contacts[{i}]"):
+            distance = physical("adjust", checked.positive("adjust", entry["adjust"]))
+            sides = ContactSides(
+                mesh=Mesh(points, named.cells, {}),
+                body_of_node=np.zeros(len(points), dtype=np.int64),
+                names=("",),
+                pairs=(pair,),
+                length=1.0,
+                force=1.0,
+            )
+            rows = linearisation(sides, "nts", None)(np.zeros(points.size))
+            near = np.abs(rows.c) <= distance
+            nodes = pair.slave_nodes[rows.place[near]]
+            at = dofs_of(nodes, dim).reshape(-1, dim)
+            # B contains the unit vector towards the master at the slave node
+            towards = rows.B[np.flatnonzero(near)[:, None], at].toarray()
+            points[nodes] += rows.c[near][:, None] * towards
+            if (oriented("adjust", points, named.cells) != named.cells).any():
+                raise InputError("adjust: a cell folds; expected a smaller distance")
+    return named._replace(points=points)
 
 
 def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:
@@ -538,15 +710,15 @@ def _chain(where: str, edges: Nodes) -> Nodes:
 
 
 def _units(
-    entry: object, named: NamedMesh, load: NDArray[np.float64]
+    entry: object, named: NamedMesh, load: NDArray[np.float64], softest: float
 ) -> tuple[float, float]:
+    """Return the units of length and force of the QP; `softest` is the smallest E."""
     units = checked.table("units", entry)
     with located("units"):
         checked.only_keys(units, ("length", "force"))
-        total = float(np.linalg.norm(load, axis=1).sum())
-        if total == 0:
-            raise InputError("all loads are zero; expected a load")
         extent = float(np.ptp(named.points, axis=0).max())
+        total = float(np.linalg.norm(load, axis=1).sum())
+        total = total or UNIT_STRAIN * softest * extent ** (named.dim - 1)
         return (
             physical("length", checked.positive("length", units.get("length", extent))),
             physical("force", checked.positive("force", units.get("force", total))),
@@ -554,22 +726,27 @@ def _units(
 
 
 def _place(
-    entry: dict[str, Any], named: NamedMesh, others: tuple[str, ...]
-) -> tuple[Nodes, Nodes]:
-    """Return the nodes of an entry's boundary or point, and the boundary's facets.
+    entry: dict[str, Any], named: NamedMesh, kinds: tuple[str, ...]
+) -> tuple[str, Nodes, Nodes]:
+    """Return the kind of an entry, its nodes, and the facets of its boundary.
 
     For a point, the array of facets is empty.
+
+    kinds : keys of which the entry must have exactly one
     """
+    checked.only_keys(entry, (*_PLACES, *kinds))
     where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
         raise InputError("expected either boundary or point, with a name from the mesh")
-    _keys(entry, (*where, *others))
+    of = [key for key in kinds if key in entry]
+    if len(of) != 1:
+        raise InputError(f"expected one of {', '.join(kinds[:-1])} and {kinds[-1]}")
     if where == ["point"]:
         name = _one_of(named.spots, named.words.point, entry, "point")
-        return named.spots[name], np.zeros((0, 2), dtype=np.int64)
+        return of[0], named.spots[name], np.zeros((0, 2), dtype=np.int64)
     name = _one_of(named.curves, named.words.boundary, entry, "boundary")
     facets = named.curves[name]
-    return np.unique(facets), facets
+    return of[0], np.unique(facets), facets
 
 
 def _one_of(
@@ -584,6 +761,11 @@ def _one_of(
 def _keys(entry: Mapping[str, Any], keys: tuple[str, ...]) -> None:
     """Raise InputError unless the entry has exactly these keys."""
     checked.only_keys(entry, keys)
+    _required(entry, keys)
+
+
+def _required(entry: Mapping[str, Any], keys: tuple[str, ...]) -> None:
+    """Raise InputError if a key is missing."""
     for key in keys:
         if key not in entry:
             raise InputError(f"{key} is missing")

@@ -83,7 +83,12 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
     p: Any = params
     elastic = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
     check_dimension(elastic, p)
-    laws = laws_of(p)
+    laws, whole = laws_of(p), elastic.whole
+    if not whole.f.any() and whole.lift is None and not _overlap(p):
+        raise InputError(
+            f"{p['path']}: nothing stresses the bodies; expected a load, gravity, a "
+            "displacement, or contact sides that overlap (a press fit)"
+        )
     stages = load_steps(
         p["steps"],
         p["relin"],
@@ -92,9 +97,8 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
         laws,
         quasi_static=p["loading"] == "quasi-static",
     )
-    whole_load = float(np.abs(elastic.forces.value).sum())
+    whole_load = float(np.abs(elastic.forces.value).sum()) or 1.0
     if not elastic.is_supported:
-        whole = elastic.whole
         rows = keyed_linearisation(p)(whole, laws)(np.zeros(whole.mesh.dofs))
         # the friction force of a tangential row can act in both directions
         with located(p["path"]):
@@ -123,8 +127,20 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
                 "friction of a contact with kinematics=finite is not built; expected "
                 "no friction, or kinematics=linear"
             )
-        check_dimension(bodies(*source), p)
-        if any(pair.rigid is not None for pair in bodies(*source).pairs):
+        elastic = bodies(*source)
+        check_dimension(elastic, p)
+        built = {
+            "prescribed displacements": elastic.lift is None,
+            "springs": elastic.springs is None,
+            "bodies with common nodes": elastic.piece is None,
+        }
+        for what, is_built in built.items():
+            if not is_built:
+                raise InputError(
+                    f"{what} with kinematics=finite are not built; expected "
+                    "kinematics=linear"
+                )
+        if any(pair.rigid is not None for pair in elastic.pairs):
             raise InputError(
                 "contact with a rigid body and kinematics=finite is not built; "
                 "expected a master, or kinematics=linear"
@@ -162,7 +178,7 @@ def contact_remarks(params: Mapping[str, Value]) -> tuple[str, ...]:
         float(np.ptp(mesh.points[mesh.cells[whole.body == b].ravel()], axis=0).max())
         for b in range(len(whole.names))
     )
-    if depth > MAX_OVERLAP * size:
+    if depth > MAX_OVERLAP * size and whole.f.any():  # without loads: a press fit
         found.append(
             f"{p['path']}: before any load acts, a slave node lies {depth:.3g} m "
             "inside its master (or behind the plane of its edge): check length_unit "
@@ -179,6 +195,14 @@ def contact_remarks(params: Mapping[str, Value]) -> tuple[str, ...]:
         if b < a
     ]
     return tuple(found)
+
+
+def _overlap(params: Mapping[str, Value]) -> float:
+    """Return the largest depth of a slave node inside its master before any load, m."""
+    p: Any = params
+    whole = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]).whole
+    rows = keyed_linearisation(p)(whole, laws_of(p))(np.zeros(whole.mesh.dofs))
+    return -float(rows.c.min(initial=0.0))
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:

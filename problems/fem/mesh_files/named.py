@@ -226,8 +226,7 @@ def named_mesh(file: FileMesh, chosen: Collection[str] = ()) -> NamedMesh:
     renumbered = np.full(len(points), -1)
     renumbered[used] = np.arange(used.size)
     points = points[used, :dim]
-    orient = _counter_clockwise if dim == 2 else _right_handed
-    cells = orient(path, points, renumbered[cells])
+    cells = oriented(path, points, renumbered[cells])
     outer = boundary_facets(cells, dim)
     directed = {tuple(sorted(set(facet))): facet for facet in outer.tolist()}
     node_sets = {
@@ -466,7 +465,24 @@ def _node_order(cells: Nodes, bodies: Sequence[Nodes], piece: Nodes) -> Nodes:
     return nodes[np.sort(np.unique(nodes, return_index=True)[1])]
 
 
-def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
+def oriented(path: Path | str, points: NDArray[np.float64], cells: Nodes) -> Nodes:
+    """Return cells (E, c), with the corners of mirrored cells in another order.
+
+    path : start of messages
+
+    Raises
+    ------
+    InputError
+        If a cell is flat, folded or not convex.
+
+    """
+    orient = _counter_clockwise if points.shape[1] == 2 else _right_handed
+    return orient(path, points, cells)
+
+
+def _counter_clockwise(
+    path: Path | str, points: NDArray[np.float64], cells: Nodes
+) -> Nodes:
     """Reorder clockwise cells; raise InputError for flat and non-convex cells."""
     x, triangle = points[cells], is_triangle(cells)[:, None]
     # twice the area of a quadrilateral is the cross product of its diagonals
@@ -491,7 +507,7 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
     return cells
 
 
-def _right_handed(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
+def _right_handed(path: Path | str, points: NDArray[np.float64], cells: Nodes) -> Nodes:
     """Reorder mirrored cells; raise InputError if a Jacobian is not positive."""
     cells = cells.copy()
     for block in cell_blocks(cells, 3):
