@@ -327,6 +327,7 @@ def assemble_stiffness(bodies: UnassembledBodies) -> Bodies:
     K = stiffness(bodies.mesh, D, bodies.body)
     if (S := bodies.springs) is not None:
         K = csc_array(K + S.T @ S)
+        K.sort_indices()  # scipy sorts in place, which fails once a QP is read-only
     return Bodies(**data, K=K)
 
 

@@ -508,10 +508,19 @@ class LocalSubdomains:
     def row_stiffness(self, node: Nodes, *, supports: bool) -> Vector:
         """Return the factors (k,) at torn nodes whose square roots scale rows of B.
 
+        All copies of a node have the modulus of the softest of its bodies, because a
+        gluing row is a difference of copies.
+
         supports : True for rows of supports, False for rows of gluing
         """
-        body = self.problem.layout.body[self.number]
-        E = self.problem.E[body[self.nodes.subdomain[node]]]
+        of, E_of = self.problem.layout, self.problem.E
+        E = E_of[of.body[self.number][self.nodes.subdomain[node]]]
+        if self.problem.piece is not None:
+            number = self.nodes.number[node]
+            last = of.multiplicity(number) - 1
+            for copy in range(int(last.max(initial=-1)) + 1):
+                body = of.body[of.holder(number, np.minimum(copy, last))]
+                E = np.minimum(E, E_of[body])
         if self._shape is None:
             return E
         return np.asarray(E * self._shape(node, self.nodes.number[node], supports))

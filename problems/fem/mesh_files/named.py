@@ -220,13 +220,17 @@ def named_mesh(file: FileMesh, chosen: Collection[str] = ()) -> NamedMesh:
             "cells; expected a plane mesh, or tetrahedra, wedges or hexahedra"
         )
     cells, surfaces, piece = _connected(
-        path, points[:, :dim], cells, dim, {k: len(v) for k, v in sets.items()}
+        path,
+        points[:, :dim],
+        oriented(path, points[:, :dim], cells),
+        dim,
+        {k: len(v) for k, v in sets.items()},
     )
     used = _node_order(cells, list(surfaces.values()), piece)
     renumbered = np.full(len(points), -1)
     renumbered[used] = np.arange(used.size)
     points = points[used, :dim]
-    cells = oriented(path, points, renumbered[cells])
+    cells = renumbered[cells]
     outer = boundary_facets(cells, dim)
     directed = {tuple(sorted(set(facet))): facet for facet in outer.tolist()}
     node_sets = {
@@ -550,8 +554,8 @@ def _directed(
     facet = "an edge" if facets.shape[1] == 2 else "a face"
     if (facets < 0).any():
         raise InputError(
-            f"{path}: {where} has {facet} that bounds no body in the file; expected "
-            f"every body to have a name: {words.naming}"
+            f"{path}: {where} has {facet} that bounds no body in the file (shells and "
+            f"beams are not bodies); expected every body to have a name: {words.naming}"
         )
     names = [tuple(sorted(set(facet))) for facet in facets.tolist()]
     if not all(name in boundary for name in names):

@@ -547,8 +547,8 @@ def test_nodes_of_no_cell_are_left_out(described):
          "a.toml: loads[0]: point: unknown physical point 'tip'; known: corner"),
         ("force = [0, -1e8]", "force = [0]", "a.toml: loads[0]: force = [0]; expected"),
         ("force = [0, -1e8]", "force = [0, inf]", "a.toml: loads[0]: force = inf; "),
-        ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: units: all loads are zero"),
-        ("force = [0, -1e8]", "", "a.toml: loads[0]: expected either force"),
+        ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: nothing stresses the "),
+        ("force = [0, -1e8]", "", "a.toml: loads[0]: expected one of force"),
         ("force = [0, -1e8]", "forces = [0, -1e8]",
          "a.toml: loads[0]: unknown key 'forces'; did you mean 'force'? known: "),
         ('point = "corner"', 'pint = "corner"',
@@ -652,7 +652,8 @@ def bent(points):
         (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3, 0] * 2]}, {}, {}, 11), "cells of type"
          " tetra10; expected cells of first order: Mesh.ElementOrder = 1 in the .geo "
          "file, or gmsh -3 -order 1"),
-        (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "the triangle around "
+         "(0.666667, 0, 0) repeats a node; expected distinct corners"),
         (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected a name "
          'for each: Physical Surface("NAME") in the .geo file'),
         # gmsh omits the cells of surfaces without a physical name
@@ -660,7 +661,12 @@ def bent(points):
          "that bounds no body in the file; expected every body to have a name: "
          'Physical Surface("NAME") in the .geo file'),
         (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no physical surface with cells"),
-        (lambda p, c: (p, {"a": c[:2], "b": c[2:]}, {}, {}), "bodies 'a' and 'b'"),
+        (lambda p, c: (p, {"a": c[:1], "b": c[3:]}, {}, {}), "bodies 'a' and 'b' share "
+         "the node at (1, 1), but no edge; expected separate nodes for each body, or a "
+         "common edge of cells"),
+        (lambda p, c: (p, {"a": c[[0, 3]]}, {}, {}), "bodies 'a.1' and 'a.2' share the"),
+        (lambda p, c: (p, {"a": np.vstack([c, [[0, 1, 5, 4]]])}, {}, {}), "3 cells over"
+         "lap around (1.5, 1); expected at most two cells at an edge"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),
         (lambda p, c: (p, {"a": c}, {"m": [[1, 4]]}, {}), "curve 'm' has an edge that"),
         (lambda p, c: (p + [[0, 0, 1]] * (p[:, :1] > 1), {"a": c}, {}, {}), "same z"),
@@ -725,7 +731,7 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
     )
 
 
-def test_a_binary_file_of_all_entities_has_its_remedy(tmp_path):
+def test_a_binary_file_of_all_entities_is_read(tmp_path):
     """The first curve of the binary file has no physical tag."""
     text = msh41(POINTS, *parts())
     (tmp_path / "a.msh").write_text(text)
@@ -743,8 +749,13 @@ def test_a_binary_file_of_all_entities_has_its_remedy(tmp_path):
     head, _, rest = re.split(rb"\$(?:End)?Entities\n", data)
     binary = head + b"$Entities\n" + packed + b"\n$EndEntities\n" + rest
     (tmp_path / "m.msh").write_bytes(binary)
-    with pytest.raises(InputError, match=r"m\.msh: .*Mesh\.SaveAll = 0"):
-        read_msh(tmp_path / "m.msh")
+    read, expected = (read_msh(tmp_path / f"{name}.msh") for name in "ma")
+
+    np.testing.assert_array_equal(read.cells, expected.cells)
+    np.testing.assert_array_equal(read.points, expected.points)
+    assert set(expected.curves) - set(read.curves) == {"left"}
+    for name, edge in read.curves.items():
+        np.testing.assert_array_equal(edge, expected.curves[name])
 
 
 def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
@@ -759,11 +770,15 @@ def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
     )
 
 
-def test_a_body_of_two_parts_is_refused(tmp_path):
+def test_a_set_of_two_parts_becomes_two_bodies(tmp_path):
     one, cells = square()
     both = np.vstack([one, square(at=(5.0, 0.0))[0]])
-    with pytest.raises(InputError, match="body 'a' consists of 2 disconnected parts"):
-        read(tmp_path, both, {"a": np.vstack([cells, cells + 9])}, {}, {})
+    mesh = read(tmp_path, both, {"a": np.vstack([cells, cells + 9])}, {}, {})
+
+    assert list(mesh.surfaces) == ["a.1", "a.2"]
+    assert [mesh.points[mesh.cells[c], 0].min() for c in mesh.surfaces.values()] == [
+        0.0, 5.0,
+    ]  # fmt: skip
 
 
 def test_a_stiffness_that_rounding_makes_indefinite_is_refused(described):
