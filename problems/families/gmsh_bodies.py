@@ -96,9 +96,17 @@ class GmshBodies(ContactFamily):
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the keys of the case in which every edge of the mesh is bisected."""
-        from mortarbench.problems.models.gmsh_bodies import laws_of
+        from mortarbench.problems.models.gmsh_bodies import (
+            is_nearly_incompressible,
+            laws_of,
+        )
 
         finer = super().refined(params)
+        if is_nearly_incompressible(params):
+            raise InputError(
+                f"{self.name}: the error of the mesh is not estimated if nu exceeds "
+                "0.45; compare halvings=0, 1 and 2 instead"
+            )
         laws = [law.kind for law in laws_of(params)]
         refuse_coulomb(self.name, laws, "halvings=0, 1 and 2, or with finer mesh files")
         return finer
@@ -133,7 +141,10 @@ class GmshBodies(ContactFamily):
         from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
         from mortarbench.problems.models.description import remarks
-        from mortarbench.problems.models.gmsh_bodies import contact_remarks
+        from mortarbench.problems.models.gmsh_bodies import (
+            contact_remarks,
+            mesh_remarks,
+        )
 
         path = str(params["path"])
         try:
@@ -144,4 +155,5 @@ class GmshBodies(ContactFamily):
                 "expected smaller ratios between the sides of cells and between the "
                 "moduli E"
             ) from None
-        return replace(case, remarks=(*remarks(Path(path)), *contact_remarks(params)))
+        notes = (*remarks(Path(path)), *mesh_remarks(params), *contact_remarks(params))
+        return replace(case, remarks=notes)

@@ -8,13 +8,23 @@ In Voigt's notation, strain is (ε_x, ε_y, γ_xy) in 2D and
 (ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) in 3D, and stress has the same order. In 2D,
 stiffness is per unit thickness: K is in Pa and forces are in N/m. In 3D, K is in N/m
 and forces are in N.
+
+If ν > `NEARLY_INCOMPRESSIBLE`, the dilatation θ of quadrilaterals, hexahedra and wedges
+is replaced by its mean over the cell (B-bar method: Hughes 1980, Int. J. Numer. Methods
+Eng. 15; Simo, Taylor and Pister 1985). With the bulk modulus κ, the stiffness changes
+by
+
+    −κ ∫ (b − b̄)ᵀ(b − b̄),      θ = b u,   b̄ = ∫ b / ∫ 1
+
+which is zero on linear triangles and tetrahedra, and for uniform strain.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +46,9 @@ from mortarbench.problems.fem.kernels import (
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
 
 Plane = Literal["strain", "stress"]
+#: largest Poisson's ratio of fully integrated cells. Closer to ½, they are too stiff,
+#: because θ vanishes at every Gauss point
+NEARLY_INCOMPRESSIBLE = 0.45
 #: indices of the components of a symmetric tensor in Voigt's notation, by dimension
 VOIGT = {
     2: np.array([[0, 2], [2, 1]]),
@@ -144,7 +157,66 @@ def stiffness(
         pattern.slot,
     )
     n = mesh.dofs
-    return csc_array((data, pattern.indices, pattern.indptr), shape=(n, n))
+    K = csc_array((data, pattern.indices, pattern.indptr), shape=(n, n))
+    for part in mean_dilatation(mesh, D.reshape(-1, *D.shape[-2:]), material):
+        off = part.b - part.mean
+        change = -np.einsum("qe,qea,qeb->eab", part.kappa * part.volume, off, off)
+        row, column = (
+            np.broadcast_to(part.dofs[(..., *axis)], change.shape).ravel()
+            for axis in ((slice(None), None), (None, slice(None)))
+        )
+        K = K + csc_array((change.ravel(), (row, column)), shape=(n, n))
+        K.sort_indices()
+    return K
+
+
+class MeanDilatation(NamedTuple):
+    """Dilatation of E cells of one type at their Gauss points and on average."""
+
+    cells: NDArray[np.int64]  #: (E,) numbers of the cells
+    dofs: NDArray[np.int64]  #: (E, m) dofs of each cell
+    kappa: Vector  #: (E,) bulk modulus
+    volume: Floats  #: (q, E) weight of each Gauss point
+    b: Floats  #: (q, E, m) rows b in θ = b u at the Gauss points
+    centre: Floats  #: (E, m) rows b at the centres
+
+    @property
+    def mean(self) -> Floats:
+        """Mean b̄ (E, m) of b over each cell."""
+        total = np.einsum("qe,qem->em", self.volume, self.b)
+        return np.asarray(total / self.volume.sum(axis=0)[:, None])
+
+
+def mean_dilatation(
+    mesh: Mesh, D: Floats, material: NDArray[np.int64]
+) -> Iterator[MeanDilatation]:
+    """Yield the cells whose dilatation is replaced by its mean.
+
+    In plane stress, D corresponds to plane strain with Poisson's ratio ν/(1 + ν), which
+    is below 0.34, so that no cells are selected.
+
+    D, material : (k, v, v) and (E,), see `stiffness`
+    """
+    lame, shear = D[:, 0, 1], D[:, -1, -1]
+    if not (nearly := lame > 2 * NEARLY_INCOMPRESSIBLE * (lame + shear)).any():
+        return
+    for block in mesh.blocks:
+        chosen = nearly[material[block.cells]]
+        if block.kind in ("triangle", "tetra") or not chosen.any():
+            continue
+        nodes, of = block.nodes[chosen], material[block.cells[chosen]]
+        element, corners = ELEMENTS[mesh.dim, nodes.shape[1]], mesh.points[nodes]
+        *slopes, centre = (
+            shape_gradients(corners, xi) for xi in (*element.points, element.centre)
+        )
+        yield MeanDilatation(
+            block.cells[chosen],
+            dofs_of(nodes, mesh.dim).reshape(len(nodes), -1),
+            lame[of] + 2 / 3 * shear[of],
+            element.weights[:, None] * np.stack([det for _, det in slopes]),
+            np.stack([gradients.reshape(len(nodes), -1) for gradients, _ in slopes]),
+            centre[0].reshape(len(nodes), -1),
+        )
 
 
 @dataclass(frozen=True, eq=False)

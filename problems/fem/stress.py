@@ -23,6 +23,7 @@ from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.fem.elasticity import (
     Plane,
     cell_dofs,
+    mean_dilatation,
     shape_gradients,
     strain_matrix,
 )
@@ -31,14 +32,21 @@ from mortarbench.problems.fem.mesh import Mesh
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
     """Return σ = DBu (E, v) at the cell centres, Pa; u in m, D (v, v) or (E, v, v)."""
-    if mesh.dim == 2:
-        return _stress_at(mesh.element.centre, mesh, D, u)
     stress = np.empty((len(mesh.cells), D.shape[-1]))
+    if mesh.dim == 2:
+        stress = _stress_at(mesh.element.centre, mesh, D, u)
     # the centre of a degenerate hexahedron is not that of the wedge or tetrahedron
-    for block in mesh.blocks:
+    for block in mesh.blocks if mesh.dim > 2 else ():
         part = Mesh(mesh.points, block.nodes, {})
         of_cells = D if D.ndim == 2 else D[block.cells]
         stress[block.cells] = _stress_at(part.element.centre, part, of_cells, u)
+    each = D.reshape(-1, *D.shape[-2:])
+    material = (
+        np.arange(len(mesh.cells)) if D.ndim > 2 else np.zeros_like(mesh.cells[:, 0])
+    )
+    for nearly in mean_dilatation(mesh, each, material):
+        off = np.einsum("em,em->e", nearly.mean - nearly.centre, u[nearly.dofs])
+        stress[nearly.cells, : mesh.dim] += (nearly.kappa * off)[:, None]
     return stress
 
 

@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 from scipy.sparse import vstack
+from scipy.spatial import KDTree
 
 from mortarbench.harness import Case, InputError, Reference, Value
 from mortarbench.harness.checked import located
+from mortarbench.harness.mechanics import boundary_facets, cell_blocks, cell_facets
 from mortarbench.problems.contact.balance import check_balance, is_determined
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
@@ -31,6 +33,8 @@ from mortarbench.problems.duality.problem import (
     elastic_bodies_of,
     keyed_linearisation,
 )
+from mortarbench.problems.fem.elasticity import NEARLY_INCOMPRESSIBLE, mean_dilatation
+from mortarbench.problems.fem.mesh import Mesh, Nodes, facet_quadrature
 from mortarbench.problems.models.description import (
     pair_laws,
     read_bodies,
@@ -48,6 +52,11 @@ MAX_ARC_ANGLE = np.pi / 4
 #: smallest body. The chords of touching arcs overlap by up to 5R/n² with n edges per
 #: circle, which is 0.4 % of R for n = 36
 MAX_OVERLAP = 0.01
+#: largest distance of two nodes at the same place, relative to the extent of the mesh
+COINCIDENCE = 1e-9
+#: smallest cosine of the angle between the normals of adjacent contact faces; a right
+#: angle, as at the edges of a box, is admissible
+MIN_COSINE = -0.5
 
 
 def problem(params: Mapping[str, Value]) -> ContactProblem:
@@ -205,6 +214,66 @@ def _overlap(params: Mapping[str, Value]) -> float:
     return -float(rows.c.min(initial=0.0))
 
 
+def mesh_remarks(params: Mapping[str, Value]) -> tuple[str, ...]:
+    """Return remarks on cracks, folded contact faces, and cells that are too stiff."""
+    p: Any = params
+    whole = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]).whole
+    mesh, remarks = whole.mesh, list[str]()
+    nodes = np.unique(boundary_facets(mesh.cells, mesh.dim))
+    tree = KDTree(mesh.points[nodes])
+    reach = COINCIDENCE * float(np.ptp(mesh.points, axis=0).max())
+    pairs = nodes[tree.query_pairs(reach, output_type="ndarray")]
+    sides = np.concatenate([np.zeros(0, dtype=int), *(q.nodes for q in whole.pairs)])
+    pairs = pairs[~np.isin(pairs, sides).all(axis=1)]  # faces of a crack in contact
+    pairs = pairs[np.diff(whole.piece_of_node[pairs], axis=1)[:, 0] == 0]
+    if len(pairs):
+        remarks.append(
+            f"{whole.names[whole.body_of_node[pairs[0, 0]]]!r} has {len(pairs)} pairs "
+            f"of nodes at the same place, for example at {_at(mesh, pairs[0])}: the "
+            "cells are not joined there; merge these nodes, unless a crack is meant"
+        )
+    for side in {id(s): s for q in whole.pairs for s in q.sides if s.ndim > 1}.values():
+        if len(side) and (fold := _fold(mesh, side)) is not None:
+            remarks.append(
+                f"a contact side is folded at {_at(mesh, fold)}: contact there is not "
+                "reliable; expected faces that turn by less than 120° at their edges"
+            )
+    for b, material in enumerate(whole.materials):
+        kinds = {
+            part.kind for part in cell_blocks(mesh.cells[whole.body == b], mesh.dim)
+        }
+        if (
+            material.nu > NEARLY_INCOMPRESSIBLE
+            and p["plane"] != "stress"
+            and kinds & {"triangle", "tetra"}
+        ):
+            remarks.append(
+                f"{whole.names[b]!r} has linear triangles or tetrahedra, which are too "
+                f"stiff for nu = {material.nu:g}; use quadrilaterals or hexahedra"
+            )
+    return tuple(f"{p['path']}: {remark}" for remark in remarks)
+
+
+def _at(mesh: Mesh, nodes: Nodes) -> str:
+    """Return the centre of nodes as text."""
+    centre = mesh.points[nodes].mean(axis=0)
+    return "(" + ", ".join(f"{x:.6g}" for x in centre) + ") m"
+
+
+def _fold(mesh: Mesh, faces: Nodes) -> Nodes | None:
+    """Return the nodes of an edge at which faces fold, or of a folded face, or None."""
+    areas = facet_quadrature(mesh.points, faces)[1]
+    normal = areas.sum(axis=0) / np.linalg.norm(areas.sum(axis=0), axis=1)[:, None]
+    if (bad := (np.einsum("qkx,kx->qk", areas, normal) <= 0).any(axis=0)).any():
+        return np.asarray(faces[bad.argmax()])
+    _, edges, face = cell_facets(faces, 2)
+    order = np.lexsort(edges.T)
+    shared = np.flatnonzero((np.diff(edges[order], axis=0) == 0).all(axis=1))
+    one, other = face[order[shared]], face[order[shared + 1]]
+    turned = np.einsum("kx,kx->k", normal[one], normal[other]) < MIN_COSINE
+    return np.asarray(edges[order[shared[turned]]][0]) if turned.any() else None
+
+
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
     """Return the friction law of each pair, see `pair_laws`."""
     return pair_laws(read_description(Path(str(params["path"])))["contacts"], params)
@@ -215,6 +284,17 @@ def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
     """Return the bodies of a TOML file; `sha256` only distinguishes cached results."""
     del sha256
     return elastic_bodies_of(read_bodies(Path(path), plane, halvings))
+
+
+def is_nearly_incompressible(params: Mapping[str, Value]) -> bool:
+    """Return True if cells of any body have a mean dilatation.
+
+    Interpolated to finer cells, such a displacement has a large energy, so that meshes
+    cannot be compared in the energy norm.
+    """
+    p: Any = params
+    whole = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]).whole
+    return any(mean_dilatation(whole.mesh, whole.elasticity, whole.body))
 
 
 def has_arcs(params: Mapping[str, Value]) -> bool:

@@ -664,7 +664,7 @@ def bent(points):
         (lambda p, c: (p, {"a": c[:1], "b": c[3:]}, {}, {}), "bodies 'a' and 'b' share "
          "the node at (1, 1), but no edge; expected separate nodes for each body, or a "
          "common edge of cells"),
-        (lambda p, c: (p, {"a": c[[0, 3]]}, {}, {}), "bodies 'a.1' and 'a.2' share the"),
+        (lambda p, c: (p, {"a": c[[0, 3]]}, {}, {}), "bodies 'a.1' and 'a.2' share"),
         (lambda p, c: (p, {"a": np.vstack([c, [[0, 1, 5, 4]]])}, {}, {}), "3 cells over"
          "lap around (1.5, 1); expected at most two cells at an edge"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),

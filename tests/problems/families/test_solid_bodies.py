@@ -153,7 +153,7 @@ def test_pressure_picture_and_grid_are_written(tmp_path, monkeypatch, capsys):
         ('slave = "foot"', 'slave = "left"', "", "slave and master share nodes"),
         ("[0, 0, -1e6]", "[0, -1e6]", "",
          "traction = [0, -1000000.0]; expected three numbers, [x, y, z]"),
-        ('fix = ["z"]', 'fix = ["w"]', "", "unknown component 'w'; known: all, normal, x"),
+        ('fix = ["z"]', 'fix = ["w"]', "", "unknown component 'w'; known: all, normal"),
         ('boundary = "top"', 'boundary = "base"', "", "acts on 'base' in z, where a"),
         ('fix = ["y"]', 'fix = ["x"]', "",
          "body 'upper': nothing balances its load in y; expected a support"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import spsolve
 from skfem import Basis, ElementHex1, ElementQuad1, ElementVector, MeshHex, MeshQuad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
@@ -20,9 +21,11 @@ from mortarbench.problems.fem.mesh import (
     Mesh,
     as_vectors,
     boundary_facets,
+    box,
     dofs_of,
     half_disc,
     half_ring,
+    nodal_lengths,
     rectangle,
 )
 from mortarbench.problems.fem.stress import (
@@ -31,6 +34,7 @@ from mortarbench.problems.fem.stress import (
     recover,
     von_mises,
 )
+from tests.support.hexahedra import WEDGES, bent, divided
 
 STEEL = Material(E=200e9, nu=0.3)
 
@@ -333,3 +337,63 @@ def test_a_half_disc_with_triangles_at_its_centre_stretches_exactly():
     assert u @ K @ u == pytest.approx(strain @ D @ strain * area)
     assert forces[inside] == pytest.approx(0, abs=1e-12 * abs(forces).max())
     assert np.linalg.eigvalsh(K.toarray())[3] > 1e-8 * abs(K).max()
+
+
+def strained(points):
+    """Return a displacement with uniform strain, including a change of volume."""
+    gradient = np.array([[1.0, 0.3, -0.2], [0.1, -0.6, 0.4], [0.2, -0.1, 0.5]])
+    dim = points.shape[1]
+    return (points @ gradient[:dim, :dim].T).ravel()
+
+
+CUBE = bent(box((0, 0, 0), (1, 1, 1), (2, 2, 2)))
+SHAPES = {"quads": distorted(3), "hexahedra": CUBE, "wedges": divided(CUBE, WEDGES)}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("nu", [0.3, 0.4999])
+def test_uniform_strain_has_uniform_stress_in_distorted_cells(name, nu):
+    """Patch test: no forces at inner nodes, and the energy ½ εᵀDε V."""
+    mesh = SHAPES[name]
+    D = elasticity_matrix(Material(E=1.0, nu=nu), "strain" if mesh.dim == 2 else None)
+    K, u = stiffness(mesh, D), strained(mesh.points)
+    inner = np.setdiff1d(
+        np.arange(len(mesh.points)), boundary_facets(mesh.cells, mesh.dim)
+    )
+    force = K @ u
+    stress = centre_stress(mesh, D, u)
+
+    assert inner.size
+    assert np.abs(force[dofs_of(inner, mesh.dim)]).max() < 1e-11 * np.abs(force).max()
+    np.testing.assert_allclose(
+        stress, np.broadcast_to(stress[0], stress.shape), rtol=1e-9, atol=1e-9
+    )
+    np.testing.assert_allclose(K @ rigid_modes(mesh.points), 0, atol=1e-10 * K.max())
+
+
+def test_a_nearly_incompressible_cell_has_one_mode_of_dilatation():
+    """Fully integrated, a quadrilateral has three such modes and a hexahedron seven."""
+    for mesh, plane in ((rectangle((0, 0), (1, 1), (1, 1)), "strain"),
+                        (box((0, 0, 0), (1, 1, 1), (1, 1, 1)), None)):  # fmt: skip
+        D = elasticity_matrix(Material(E=1.0, nu=0.4999999), plane)
+        values = np.linalg.eigvalsh(stiffness(mesh, D).toarray())
+        assert (values > 1e3).sum() == 1
+        assert values[0] > -1e-8
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.499, 0.4999])
+def test_a_nearly_incompressible_beam_bends_as_beam_theory_says(nu):
+    """Deflection PL³/3EI + 6PL/5GA in plane strain, with square cells."""
+    mesh = rectangle((0, 0), (10, 1), (80, 8))
+    material = Material(E=1.0, nu=nu)
+    K = stiffness(mesh, elasticity_matrix(material, "strain"))
+    f, tip = np.zeros(mesh.dofs), mesh.boundaries["right"]
+    f[2 * tip + 1] = nodal_lengths(mesh.points[tip])
+    clamped = dofs_of(mesh.boundaries["left"], 2)
+    free = np.setdiff1d(np.arange(mesh.dofs), clamped)
+    u = np.zeros(mesh.dofs)
+    u[free] = spsolve(csc_array(K[free][:, free]), f[free])
+    bending = 12 * 1000 / 3 * (1 - nu**2)
+    shear = 6 / 5 * 10 * 2 * (1 + nu)
+
+    assert u[2 * tip + 1].mean() == pytest.approx(bending + shear, rel=0.015)
