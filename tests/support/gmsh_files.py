@@ -1,5 +1,7 @@
 """Mesh files in the format of gmsh, written without gmsh."""
 
+import struct
+
 import numpy as np
 
 
@@ -113,3 +115,77 @@ def stacked_blocks(folder, gap=0.0, toml=BLOCKS, sag=0.0):
     path = folder / "blocks.toml"
     path.write_text(toml)
     return path
+
+
+def entities41(points, entities, binary=False):
+    """Return a file in format 4.1, as text or binary data.
+
+    entities : (dimension, element type, cells, names of the physical groups) of each
+        entity; cells number the nodes from 0
+    """
+    order = np.argsort([dim for dim, *_ in entities], kind="stable")
+    entities = [entities[k] for k in order]
+    names = list(dict.fromkeys((e[0], name) for e in entities for name in e[3]))
+    number = {name: i + 1 for i, name in enumerate(names)}
+    parts = {"Entities": [], "Nodes": [], "Elements": []}
+
+    def add(section, kind, *values):
+        """Append numbers of one type: i, Q (size) or d."""
+        if binary:
+            data = struct.pack(f"<{len(values)}{kind}", *values)
+        else:
+            data = " ".join(f"{v!r}" for v in values).encode()
+        parts[section].append(data)
+
+    add("Entities", "Q", *(sum(e[0] == dim for e in entities) for dim in range(4)))
+    for tag, (dim, _, _, groups) in enumerate(entities, 1):
+        add("Entities", "i", tag)
+        add("Entities", "d", *[0.0] * (6 if dim else 3))
+        add("Entities", "Q", len(groups))
+        if groups:
+            add("Entities", "i", *(number[dim, name] for name in groups))
+        if dim:
+            add("Entities", "Q", 0)
+    N, E = len(points), sum(len(e[2]) for e in entities)
+    add("Nodes", "Q", 1, N, 1, N)
+    add("Nodes", "i", entities[-1][0], len(entities), 0)
+    add("Nodes", "Q", N)
+    add("Nodes", "Q", *range(1, N + 1))
+    add("Nodes", "d", *np.ravel(points).tolist())
+    add("Elements", "Q", len(entities), E, 1, E)
+    first = 1
+    for tag, (dim, kind, cells, _) in enumerate(entities, 1):
+        add("Elements", "i", dim, tag, kind)
+        add("Elements", "Q", len(cells))
+        for cell in cells:
+            add("Elements", "Q", first, *(int(node) + 1 for node in cell))
+            first += 1
+    head = b"4.1 1 8\n" + struct.pack("<i", 1) if binary else b"4.1 0 8"
+    groups = "\n".join(
+        [str(len(names)), *(f'{dim} {number[dim, n]} "{n}"' for dim, n in names)]
+    )
+    sections = {"MeshFormat": head, "PhysicalNames": groups.encode()} | {
+        name: (b"" if binary else b"\n").join(data) for name, data in parts.items()
+    }
+    return b"".join(
+        b"$%s\n%s\n$End%s\n" % (name.encode(), data, name.encode())
+        for name, data in sections.items()
+    )
+
+
+#: element types of gmsh by meshio's names of cells
+TYPES = {"vertex": 15, "line": 1, "triangle": 2, "quad": 3, "tetra": 4,
+         "hexahedron": 5, "wedge": 6}  # fmt: skip
+
+
+def entities_of(blocks, sets):
+    """Return an entity for each set of cells, see `entities41`.
+
+    blocks, sets : see `tests.support.mesh_formats.named_cells`
+    """
+    dims = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2}
+    return [
+        (dims.get(blocks[k][0], 3), TYPES[blocks[k][0]], blocks[k][1][rows], [name])
+        for name, parts in sets.items()
+        for k, rows in parts
+    ]

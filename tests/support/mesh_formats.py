@@ -93,3 +93,48 @@ def write_med(source, path):
     mesh.cell_tags = {-number: list(n) for n, number in families.items()}
     mesh.point_tags = {}
     meshio.med.write(path, mesh)
+
+
+#: two instances of a part with a surface, one of them moved and turned
+INSTANCES = """\
+*PART, NAME=square
+*NODE
+1, 0, 0
+2, 1, 0
+3, 2, 0
+4, 0, 2
+5, 1, 2
+6, 2, 2
+*ELEMENT, TYPE=CPS4, ELSET=cells
+1, 1, 2, 5, 4
+2, 2, 3, 6, 5
+*NSET, NSET=low
+1, 2, 3
+*ELSET, ELSET=all, GENERATE
+1, 2, 1
+*SURFACE, NAME=high
+all, S3
+*SURFACE, NAME=bottom
+cells, S1
+*END PART
+*ASSEMBLY, NAME=a
+*INSTANCE, NAME=lower, PART=square
+*END INSTANCE
+*INSTANCE, NAME=upper, PART=square
+2.0, 4.0
+2.0, 4.0, 0.0, 2.0, 4.0, 1.0, 180.0
+*END INSTANCE
+*NSET, NSET=axis, INSTANCE=lower
+1, 4
+*NSET, NSET=axis, INSTANCE=upper
+3, 6
+*SURFACE, NAME=foot
+upper.cells, S3
+*SURFACE, NAME=table
+lower.all, S3
+*SURFACE, NAME=top
+upper.cells, S1
+*SURFACE, NAME=base
+lower.cells, S1
+*END ASSEMBLY
+"""

@@ -353,7 +353,7 @@ def _motion(
         [_number(field, line) for field in fields if field]
         for line, fields in section.lines
     ]
-    if [len(row) for row in numbers] not in ([], [3], [2], [3, 7]):
+    if [len(row) for row in numbers] not in ([], [2], [3], [2, 7], [3, 7]):
         raise InputError(
             f"line {section.line}: *INSTANCE; expected a line with a translation, and "
             "a line with two points of an axis and an angle"

@@ -167,11 +167,11 @@ def test_a_spring_on_an_inclined_side_acts_along_its_normal(tmp_path, monkeypatc
               {})
     )  # fmt: skip
     Path("a.toml").write_text(
-        f"""\
+        """\
 mesh = "m.msh"
 steps = 1
 gravity = [0, -10]
-bodies = [{{ name = "a", E = 1e15, nu = 0.3, density = 100 }}]
+bodies = [{ name = "a", E = 1e15, nu = 0.3, density = 100 }]
 [[supports]]
 boundary = "left"
 spring = 1e6
@@ -180,7 +180,7 @@ boundary = "right"
 spring = 1e6
 [[contacts]]
 slave = "top"
-rigid = {{ shape = "plane", point = [0, 5], normal = [0, -1] }}
+rigid = { shape = "plane", point = [0, 5], normal = [0, -1] }
 """
     )
     case, s, values = solved("bodies:a.toml/dual")

@@ -7,10 +7,13 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.fem.mesh_files.reading import read_msh
+from mortarbench.problems.fem.mesh import nodal_areas
+from mortarbench.problems.fem.mesh_files.named import named_mesh
+from mortarbench.problems.fem.mesh_files.reading import read_mesh_file, read_msh
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.gmsh_files import entities41, solids22, text22
 from tests.support.hexahedra import TETRAHEDRA, WEDGES
-from tests.support.mesh_formats import write_inp, write_med
+from tests.support.mesh_formats import INSTANCES, write_inp, write_med
 from tests.support.solid_blocks import TOML, solid_blocks
 
 KINDS = {"tetra": TETRAHEDRA, "wedge": WEDGES, "hexahedron": None}
@@ -61,9 +64,6 @@ def test_a_mesh_has_the_bodies_and_sides_of_the_msh_file(tmp_path, kind, name):
 
 
 def named_like(path, expected):
-    from mortarbench.problems.fem.mesh_files.named import named_mesh
-    from mortarbench.problems.fem.mesh_files.reading import read_mesh_file
-
     return named_mesh(read_mesh_file(path), expected.surfaces)
 
 
@@ -318,3 +318,140 @@ def test_other_content_is_not_a_med_file(tmp_path):
         (tmp_path / "a.med").write_bytes(content)
         with pytest.raises(InputError, match=r"a\.med: not a \.med file \(HDF5\)"):
             read_msh(tmp_path / "a.med")
+
+
+def test_instances_are_moved_copies_of_their_part(tmp_path):
+    """The second square is turned by 180° about a point of the first."""
+    (tmp_path / "a.inp").write_text(INSTANCES)
+    named = read_msh(tmp_path / "a.inp")
+    first, second = named.points[:6], named.points[6:]
+
+    assert sorted(named.surfaces) == ["lower.cells", "upper.cells"]
+    np.testing.assert_allclose(second, [2, 4] - first, atol=1e-15)
+    assert facets(named, "foot") == facets(named, "table")
+    assert facets(named, "base") == {frozenset({(0, 0), (1, 0)}),
+                                     frozenset({(1, 0), (2, 0)})}  # fmt: skip
+    # sets of the assembly add members of both instances
+    assert set(named.points[named.spots["axis"]][:, 0].round(12)) == {0.0}
+    # the elements of an instance are a body of its name, if the description uses it
+    whole = named_mesh(read_mesh_file(tmp_path / "a.inp"), ["upper"])
+    assert sorted(whole.surfaces) == ["lower.cells", "upper"]
+
+
+@pytest.mark.parametrize(
+    ("turn", "expected"),
+    [
+        ("", [1, 2, 3]),
+        ("0, 0, 0, 0, 0, 2, 90", [-2, 1, 3]),  # (1, 2) turns to (−2, 1)
+        ("5, 0, 0, 5, 0, -1, 90.", [7, 4, 3]),  # clockwise about (5, 0)
+        ("0, 0, 0, 1, 1, 1, 120", [3, 1, 2]),  # x → y → z → x
+    ],
+)  # fmt: skip
+def test_an_instance_is_translated_and_then_rotated(tmp_path, turn, expected):
+    assert ONE["C3D8"][0][3] == (0, 1, 0)  # node 4 of the part
+    text = f"*PART, NAME=p\n{one_element('C3D8')}*END PART\n*ASSEMBLY\n"
+    text += f"*INSTANCE, NAME=i, PART=P\n1, 1, 3\n{turn}\n*END INSTANCE\n"
+    (tmp_path / "a.inp").write_text(f"{text}*NSET, NSET=o\ni.4\n*END ASSEMBLY\n")
+    named = read_msh(tmp_path / "a.inp")
+
+    np.testing.assert_allclose(named.points[named.spots["o"]], [expected], atol=1e-14)
+
+
+def test_node_sets_of_element_sets_and_short_lines(tmp_path):
+    """Missing coordinates are 0, exponents may be D, unused nodes are ignored."""
+    text = (
+        "*NODE, NSET=all\n1\n2, 1.D0\n3, 1, 1.0d+00\n4,, 1\n"
+        "5, 2.0, 0,, 1\n6, 2, 1\n99, 7, 7, 7.5\n"
+        "*ELEMENT, TYPE=CPS4, ELSET=a\n1, 1, 2, 3, 4\n*ELEMENT, TYPE=CPS4, ELSET=b\n"
+        "2, 2, 5, 6,\n3\n*NSET, NSET=right, ELSET=b\n*ELSET, ELSET=both\na, b\n"
+    )
+    (tmp_path / "a.inp").write_text(text)
+    named = read_msh(tmp_path / "a.inp")
+
+    assert named.points.tolist() == [[0, 0], [1, 0], [1, 1], [0, 1], [2, 0], [2, 1]]
+    assert named.points[named.spots["right"]].tolist() == [
+        [1, 0],
+        [1, 1],
+        [2, 0],
+        [2, 1],
+    ]
+    assert list(named.surfaces) == ["a", "b"]
+    assert named.piece.tolist() == [0, 0]
+
+
+def test_other_suffixes_name_the_formats_that_are_read(tmp_path):
+    (tmp_path / "a.stl").write_text("solid a\nendsolid a\n")
+    with pytest.raises(InputError) as e:
+        read_msh(tmp_path / "a.stl")
+    assert str(e.value).endswith(
+        "a.stl: a mesh of unknown format '.stl'; expected .msh (gmsh), .inp (Abaqus, "
+        "CalculiX) or .med (Salome)"
+    )
+
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_an_entity_may_belong_to_several_groups(tmp_path, binary):
+    """Groups of one entity, as in "sides" and "left" of one curve."""
+    entities = [
+        (1, 1, [[3, 0]], ["sides", "left"]),
+        (1, 1, [[1, 2]], ["sides"]),
+        (1, 1, [[0, 1]], []),
+        (2, 3, [[0, 1, 2, 3]], ["everything", "body"]),
+    ]
+    (tmp_path / "a.msh").write_bytes(entities41(SQUARE, entities, binary))
+    file = read_mesh_file(tmp_path / "a.msh")
+    named = named_mesh(file, ["body"])
+
+    assert {name: len(curve) for name, curve in named.curves.items()} == {
+        "sides": 2, "left": 1,
+    }  # fmt: skip
+    assert list(named.surfaces) == ["body"]
+    assert list(named_mesh(file).surfaces) == ["everything"]
+
+
+@pytest.mark.parametrize("name", ["a.msh", "a.inp"])
+def test_facets_and_cells_that_are_listed_twice_count_once(tmp_path, name):
+    """A group of format 2 repeats its cells; a surface may name a face twice."""
+    if name == "a.inp":
+        text = one_element("C3D8", "*Surface, name=top\nBody, S2\n5, S2\nBody, S2\n")
+        text += "*ELEMENT, TYPE=S4, ELSET=top\n9, 5, 6, 7, 8\n10, 8, 7, 6, 5\n"
+        text += "*ELEMENT, TYPE=C3D8, ELSET=again\n6, 5, 6, 7, 8, 1, 2, 3, 4\n"
+    else:
+        cell, corners = [list(range(8))], np.array(ONE["C3D8"][0])
+        text = solids22(
+            corners,
+            {"Body": cell, "again": cell},
+            {"top": [[4, 5, 6, 7], [7, 6, 5, 4]]},
+        )
+    (tmp_path / name).write_text(text)
+    named = read_msh(tmp_path / name)
+
+    assert len(named.cells) == 1
+    assert list(named.surfaces) == ["Body"]
+    assert len(named.curves["top"]) == 1
+    assert nodal_areas(named.points, named.curves["top"])[1].sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "cells", "faces"),
+    [(4, [[0, 1, 2, 3], [1, 2, 3, 3]], [[0, 1, 2]]),
+     (5, [[0, 1, 2, 2, 4, 5, 6, 7]], [[0, 1, 2]]),
+     (4, [[0, 1, 2, 3]], [[0, 1, 1]])],
+)  # fmt: skip
+def test_a_cell_that_repeats_a_node_is_refused_with_its_place(
+    tmp_path, kind, cells, faces
+):
+    points = np.array(ONE["C3D8"][0])
+    body = [f"{i} {kind} 2 1 1 {' '.join(str(n + 1) for n in c)}"
+            for i, c in enumerate(cells, 1)]  # fmt: skip
+    rows = [f"{i} 2 2 2 2 {' '.join(str(n + 1) for n in c)}"
+            for i, c in enumerate(faces, 9)]  # fmt: skip
+    groups = ['3 1 "body"', '2 2 "face"']
+    (tmp_path / "a.msh").write_text(text22(points, groups, body + rows))
+    with pytest.raises(
+        InputError, match=r"around \(.*\) repeats a node; expected dist"
+    ):
+        read_msh(tmp_path / "a.msh")
