@@ -123,13 +123,20 @@ ELSEWHERE = {
     "mortarbench solve bodies:press.toml/parts=20/glue=redundant/dual "
     "--solver smalbe": "test_subdomains.py; the file is that of own-geometry.md",
     "gmsh -2 -order 1 press.geo": "gmsh is not installed; its output is in tests/data",
+    "gmsh -2 -order 1 fit.geo": "the same",
+    "gmsh -2 -order 1 pipe.geo": "the same",
+    "gmsh -2 -order 1 bracket.geo": "the same",
     "gmsh -3 -order 1 blocks.geo": "gmsh is not installed; its output is in tests/data",
     ".venv/bin/python -m pip install -c constraints.txt -e '.[cluster]'": (
         "the environment exists"
     ),
 }
 #: files that programs outside of the test environment would write, by page
-SUPPLIED = {"own-geometry": ("press.msh",), "solids": ("blocks.msh",)}
+SUPPLIED = {
+    "own-geometry": ("press.msh",),
+    "solids": ("blocks.msh",),
+    "loads": ("fit.msh", "pipe.msh", "bracket.msh"),
+}
 #: files that the commands of a page must write, with a pattern of their contents
 PROMISED = {
     "tutorial": {
@@ -143,6 +150,7 @@ PROMISED = {
         "press.vtu": r'Name="pressure"',
         "press-disc-on-upper.csv": "pressure_Pa",
     },
+    "loads": {"fit.png": "", "pipe.png": "", "bracket.png": ""},
     "solids": {
         "blocks.png": "",
         "blocks.vtu": r'Name="pressure"',

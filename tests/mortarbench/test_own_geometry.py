@@ -89,7 +89,7 @@ def test_the_refusals_quoted_on_the_page_are_the_actual_messages(solved):
         for path in (ROOT / folder).rglob("*.py")
     )
     for words in (
-        "cells of type", "cells without a name", "share nodes", "is closed",
+        "cells of type", "cells without a name", "share the node at", "is closed",
         "nothing balances", "the supports allow a rigid motion of some body",
         "Pa is softer than rubber", "with slave and master exchanged",
         "where a support fixes the displacement", "a drawing, not a mesh",

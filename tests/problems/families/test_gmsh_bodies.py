@@ -658,7 +658,8 @@ def bent(points):
          'for each: Physical Surface("NAME") in the .geo file'),
         # gmsh omits the cells of surfaces without a physical name
         (lambda p, c: (p, {"a": c[:1]}, {"m": [[7, 8]]}, {}), "curve 'm' has an edge "
-         "that bounds no body in the file; expected every body to have a name: "
+         "that bounds no body in the file (shells and beams are not bodies); expected "
+         "every body to have a name: "
          'Physical Surface("NAME") in the .geo file'),
         (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no physical surface with cells"),
         (lambda p, c: (p, {"a": c[:1], "b": c[3:]}, {}, {}), "bodies 'a' and 'b' share "

@@ -136,7 +136,8 @@ def test_mirrored_cells_are_turned(tmp_path, kind):
         (lambda b: b.cells[:, [0, 2, 1, 3, 4, 5, 6, 7]], "the hexahedron around "
          "(0.25, 0.25, 0.25) has no volume or folds over; expected distinct corners"),
         (lambda b: b.cells[:4], "surface 'block_top' has a face that bounds "
-         "no body in the file; expected every body to have a name: "
+         "no body in the file (shells and beams are not bodies); expected every body "
+         "to have a name: "
          'Physical Volume("NAME") in the .geo file'),
         (lambda b: np.hstack([b.cells, b.cells, b.cells[:, :4]]), "cells of type "
          "hexahedron20; expected cells of first order: Mesh.ElementOrder = 1 in the "
