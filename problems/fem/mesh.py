@@ -26,7 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
-from mortarbench.harness.mechanics import CellBlock, boundary_facets, cell_blocks
+from mortarbench.harness.mechanics import (
+    CellBlock,
+    boundary_facets,
+    cell_blocks,
+    cell_facets,
+)
 from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, QUAD, Element
 
 Nodes = NDArray[np.int64]
@@ -454,6 +459,21 @@ def prefixed(mesh: Mesh, prefix: str) -> Mesh:
 def is_triangle(cells: Nodes) -> NDArray[np.bool_]:
     """Return a mask (E,) of the triangles among cells (E, 4)."""
     return np.asarray(cells[:, 2] == cells[:, 3])
+
+
+def adjacent_cells(cells: Nodes, dim: int) -> tuple[Nodes, Nodes, Nodes]:
+    """Return pairs of cells (k,) and (k,) with a common facet, and the facets (k, m).
+
+    Pairs are sorted by facet.
+
+    >>> adjacent_cells(rectangle((0, 0), (2, 1), (2, 1)).cells, 2)
+    (array([0]), array([1]), array([[1, 4]]))
+    """
+    facets, names, cell = cell_facets(cells, dim)
+    order = np.lexsort(names.T)
+    shared = np.flatnonzero((np.diff(names[order], axis=0) == 0).all(axis=1))
+    one, other = order[shared], order[shared + 1]
+    return cell[one], cell[other], facets[one]
 
 
 def nodal_lengths(chain: NDArray[np.float64]) -> Vector:

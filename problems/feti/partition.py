@@ -18,8 +18,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
-from mortarbench.harness.mechanics import cell_facets
-from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.fem.mesh import Nodes, adjacent_cells
 
 Labels = NDArray[np.int64]
 
@@ -90,11 +89,8 @@ def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
     rectangles of unit area, and the area of the face if they are boxes of unit volume.
     """
     dim = points.shape[1]
-    facets, names, cell = cell_facets(cells, dim)
-    order = np.lexsort(names.T)
-    shared = np.flatnonzero((np.diff(names[order], axis=0) == 0).all(axis=1))
-    one, other = cell[order[shared]], cell[order[shared + 1]]
-    ends, centre = points[facets[order[shared]]], points[cells].mean(axis=1)
+    one, other, facets = adjacent_cells(cells, dim)
+    ends, centre = points[facets], points[cells].mean(axis=1)
     ratio = _facet_size(ends) / np.linalg.norm(centre[one] - centre[other], axis=1)
     size = ratio ** ((dim - 1) / dim)
     weight = np.clip(np.rint(UNIT_WEIGHT * size), 1, MAX_WEIGHT).astype(np.int64)

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from mortarbench.harness import Case, InputError, Reference, Value
 from mortarbench.harness.checked import located
-from mortarbench.harness.mechanics import boundary_facets, cell_blocks, cell_facets
+from mortarbench.harness.mechanics import boundary_facets, cell_blocks
 from mortarbench.problems.contact.balance import check_balance, is_determined
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
@@ -34,7 +34,13 @@ from mortarbench.problems.duality.problem import (
     keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import NEARLY_INCOMPRESSIBLE, mean_dilatation
-from mortarbench.problems.fem.mesh import Mesh, Nodes, facet_quadrature
+from mortarbench.problems.fem.mesh import (
+    Mesh,
+    Nodes,
+    adjacent_cells,
+    facet_quadrature,
+)
+from mortarbench.problems.fem.mesh_files.named import place
 from mortarbench.problems.models.description import (
     pair_laws,
     read_bodies,
@@ -229,14 +235,16 @@ def mesh_remarks(params: Mapping[str, Value]) -> tuple[str, ...]:
     if len(pairs):
         remarks.append(
             f"{whole.names[whole.body_of_node[pairs[0, 0]]]!r} has {len(pairs)} pairs "
-            f"of nodes at the same place, for example at {_at(mesh, pairs[0])}: the "
-            "cells are not joined there; merge these nodes, unless a crack is meant"
+            "of nodes at the same place, for example at "
+            f"{place(mesh.points[pairs[0]])} m: the cells are not joined there; merge "
+            "these nodes, unless a crack is meant"
         )
     for side in {id(s): s for q in whole.pairs for s in q.sides if s.ndim > 1}.values():
         if len(side) and (fold := _fold(mesh, side)) is not None:
             remarks.append(
-                f"a contact side is folded at {_at(mesh, fold)}: contact there is not "
-                "reliable; expected faces that turn by less than 120° at their edges"
+                f"a contact side is folded at {place(mesh.points[fold])} m, where "
+                "contact is not reliable; expected faces that turn by less than 120° "
+                "at their edges"
             )
     for b, material in enumerate(whole.materials):
         kinds = {
@@ -254,24 +262,15 @@ def mesh_remarks(params: Mapping[str, Value]) -> tuple[str, ...]:
     return tuple(f"{p['path']}: {remark}" for remark in remarks)
 
 
-def _at(mesh: Mesh, nodes: Nodes) -> str:
-    """Return the centre of nodes as text."""
-    centre = mesh.points[nodes].mean(axis=0)
-    return "(" + ", ".join(f"{x:.6g}" for x in centre) + ") m"
-
-
 def _fold(mesh: Mesh, faces: Nodes) -> Nodes | None:
     """Return the nodes of an edge at which faces fold, or of a folded face, or None."""
     areas = facet_quadrature(mesh.points, faces)[1]
     normal = areas.sum(axis=0) / np.linalg.norm(areas.sum(axis=0), axis=1)[:, None]
     if (bad := (np.einsum("qkx,kx->qk", areas, normal) <= 0).any(axis=0)).any():
         return np.asarray(faces[bad.argmax()])
-    _, edges, face = cell_facets(faces, 2)
-    order = np.lexsort(edges.T)
-    shared = np.flatnonzero((np.diff(edges[order], axis=0) == 0).all(axis=1))
-    one, other = face[order[shared]], face[order[shared + 1]]
+    one, other, edges = adjacent_cells(faces, 2)
     turned = np.einsum("kx,kx->k", normal[one], normal[other]) < MIN_COSINE
-    return np.asarray(edges[order[shared[turned]]][0]) if turned.any() else None
+    return edges[turned.argmax()] if turned.any() else None
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:

@@ -20,7 +20,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,15 +142,23 @@ class _Section(NamedTuple):
         return self.scope.prefix + self.params[key]
 
 
-def _number(text: str, line: int, kind: Callable[[str], float] = float) -> float:
-    """Return a number, whose exponent may be written with D as in Fortran."""
-    try:
-        if "_" not in text:
-            return kind(re.sub("[dD]", "e", text))
-    except ValueError:
-        pass
-    what = "an integer" if kind is int else "a number"
-    raise InputError(f"line {line}: {shortened(text)!r}; expected {what}")
+def _numbers(
+    line: int, fields: Sequence[str], kind: Callable[[str], float] = float
+) -> list[Any]:
+    """Return numbers, whose exponents may be written with D as in Fortran."""
+    numbers = []
+    for field in fields:
+        try:
+            numbers.append(kind(field))
+        except ValueError:
+            try:
+                numbers.append(kind(re.sub("[dD]", "e", field)))
+            except ValueError:
+                what = "an integer" if kind is int else "a number"
+                raise InputError(
+                    f"line {line}: {shortened(field)!r}; expected {what}"
+                ) from None
+    return numbers
 
 
 class _Sets:
@@ -183,44 +191,42 @@ class _Sets:
             raise unknown("instance", name, known, where=f"line {section.line}")
         return scope
 
-    def resolve(
-        self, fields: Iterable[str], where: str, line: int, scope: _Scope
-    ) -> Nodes:
+    def resolve(self, fields: Iterable[str], where: str, section: _Section) -> Nodes:
         """Return the members listed as numbers or as names of other sets.
 
         Outside instances, INSTANCE.5 is a number of that instance.
         """
-        numbers, others = list[int](), [_NONE]
+        scope, numbers, others = self.scope_of(section), list[int](), [_NONE]
+        where = f"line {section.line}: {where}"
         for field in fields:
-            prefix, _, last = field.rpartition(".")
-            within = self._scopes.get(f"{prefix.upper()}.", scope) if prefix else scope
+            prefix, _, number = field.rpartition(".")
+            within = self._scopes.get(f"{prefix.upper()}.") if prefix else scope
             names = [f"{scope.prefix}{field}".upper(), field.upper()]
-            found = [name for name in names if name in self._members]
-            if found:
+            if number.isdecimal() and within is not None:
+                numbers.append(int(number) + within.offset)
+            elif found := [name for name in names if name in self._members]:
                 others.append(self._members[found[0]][1])
-            elif field.isdecimal() or (last.isdecimal() and within is not scope):
-                numbers.append(int(last) + within.offset)
             else:
-                raise unknown("set", field, self.by_name(), f"line {line}: {where}")
+                raise unknown("set", field, self.by_name(), where)
         members = np.array(numbers, dtype=np.int64)
         if (bad := ~np.isin(members, self.numbers)).any():
             raise InputError(
-                f"line {line}: {where} contains {members[bad][0] % _STRIDE}, which is "
-                "not in the file; expected numbers of nodes or elements in the file"
+                f"{where} contains {members[bad][0] % _STRIDE}, which is not in the "
+                "file; expected numbers of nodes or elements in the file"
             )
         return np.concatenate([members, *others])
 
     def members(self, section: _Section, where: str) -> Nodes:
         """Return the members that the data lines of a section list."""
-        scope, parts = self.scope_of(section), [_NONE]
-        for line, fields in section.lines:
-            if "GENERATE" not in section.params:
-                parts.append(self.resolve(filter(None, fields), where, line, scope))
-                continue
-            values = [int(_number(field, line, int)) for field in fields if field]
+        if "GENERATE" not in section.params:
+            fields = (field for _, line in section.lines for field in line if field)
+            return self.resolve(fields, where, section)
+        parts, offset = [_NONE], self.scope_of(section).offset
+        for line, fields_of_line in section.lines:
+            values = _numbers(line, list(filter(None, fields_of_line)), int)
             if len(values) not in (2, 3) or min(values[2:], default=1) < 1:
                 raise InputError(f"line {line}: {where}; expected first, last, step")
-            first, last = (value + scope.offset for value in values[:2])
+            first, last = (value + offset for value in values[:2])
             k = self.numbers[(self.numbers >= first) & (self.numbers <= last)]
             parts.append(k[(k - first) % (*values, 1)[2] == 0])
         return np.concatenate(parts)
@@ -350,8 +356,7 @@ def _motion(
     The second data line contains two points of the axis, and the angle in degrees.
     """
     numbers = [
-        [_number(field, line) for field in fields if field]
-        for line, fields in section.lines
+        _numbers(line, list(filter(None, fields))) for line, fields in section.lines
     ]
     if [len(row) for row in numbers] not in ([], [2], [3], [2, 7], [3, 7]):
         raise InputError(
@@ -397,8 +402,7 @@ def _mesh(path: Path, sections: Sequence[_Section], limit: int) -> FileMesh:
                 element_sets.resolve(
                     [section.params["ELSET"]],
                     f"set {shortened(section.name('NSET'))!r}",
-                    section.line,
-                    element_sets.scope_of(section),
+                    section,
                 )
             )
             nodes = [corners[kind][k].ravel() for kind, k in rows.items()]
@@ -443,8 +447,8 @@ def _nodes(
             continue
         number, table = list[int](), list[list[float]]()
         for line, fields in section.lines:
-            number.append(int(_number(fields[0], line, int)))
-            x = [_number(field, line) if field else 0.0 for field in fields[1:4]]
+            number += _numbers(line, fields[:1], int)
+            x = _numbers(line, [field or "0" for field in fields[1:4]])
             table.append(x + [0.0] * (3 - len(x)))
         at = np.array(number, dtype=np.int64) + section.scope.offset
         numbers.append(at)
@@ -509,7 +513,7 @@ def _table(section: _Section, kind: str) -> Nodes:
     """
     width, rows, row = 1 + CORNERS[kind], list[list[int]](), list[int]()
     for line, fields in section.lines:
-        row += [int(_number(field, line, int)) for field in fields if field]
+        row += _numbers(line, list(filter(None, fields)), int)
         if len(row) < width and not fields[-1]:
             continue
         if len(row) != width:
@@ -559,7 +563,7 @@ def _surfaces(
         is_nodal = section.params.get("TYPE", "ELEMENT").upper() == "NODE"
         of_set = node_sets if is_nodal else element_sets
         for line, (of, *labels) in section.lines:
-            members = of_set.resolve([of], where, line, of_set.scope_of(section))
+            members = of_set.resolve([of], where, section)
             if is_nodal:
                 node_sets.extend(name, members)
                 continue

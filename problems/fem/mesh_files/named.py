@@ -17,10 +17,14 @@ from mortarbench.harness.mechanics import (
     KINDS,
     boundary_facets,
     cell_blocks,
-    cell_facets,
 )
 from mortarbench.problems.fem.elements import ELEMENTS, cross
-from mortarbench.problems.fem.mesh import REPEATED, Nodes, is_triangle
+from mortarbench.problems.fem.mesh import (
+    REPEATED,
+    Nodes,
+    adjacent_cells,
+    is_triangle,
+)
 
 #: largest deviation of a plane mesh from z = const, relative to its extent
 FLATNESS_TOLERANCE = 1e-9
@@ -157,16 +161,16 @@ def checked_mesh(file: FileMesh) -> FileMesh:
             )
         corners = np.sort(nodes, axis=1)
         if (bad := (np.diff(corners) == 0).any(axis=1)).any():
-            where = _place(points[nodes[bad.argmax()]])
+            where = place(points[nodes[bad.argmax()]])
             raise InputError(
                 f"{path}: the {kind} around {where} repeats a node; expected distinct "
                 "corners"
             )
-        _, first, place = np.unique(
+        _, first, number = np.unique(
             corners, axis=0, return_index=True, return_inverse=True
         )
         order = np.argsort(first)
-        cells[kind], new[kind] = nodes[first[order]], np.argsort(order)[place.ravel()]
+        cells[kind], new[kind] = nodes[first[order]], np.argsort(order)[number.ravel()]
     return file._replace(
         cells=cells,
         cell_sets={
@@ -381,18 +385,15 @@ def _connected(
         about these nodes.
 
     """
-    _, names, cell = cell_facets(cells, dim)
-    _, facet, count = np.unique(names, axis=0, return_inverse=True, return_counts=True)
-    facet = facet.ravel()
-    if (count > 2).any():
-        place = _place(points[names[(count > 2)[facet]][0]])
+    facet = "edge" if dim == 2 else "face"
+    one, other, facets = adjacent_cells(cells, dim)
+    again = (np.diff(np.sort(facets, axis=1), axis=0) == 0).all(axis=1)
+    if again.any():
         raise InputError(
-            f"{path}: {count.max()} cells overlap around {place}; expected at most two "
-            f"cells at {'an edge' if dim == 2 else 'a face'}"
+            f"{path}: more than two cells share the {facet} around "
+            f"{place(points[facets[again.argmax()]])}; expected cells that do not "
+            "overlap"
         )
-    order = np.argsort(facet, kind="stable")
-    is_pair = np.diff(facet[order]) == 0
-    one, other = cell[order][:-1][is_pair], cell[order][1:][is_pair]
     of_set = np.repeat(np.arange(len(sizes)), list(sizes.values()))
     inside = of_set[one] == of_set[other]
     body = _components(one[inside], other[inside], len(cells))
@@ -421,9 +422,8 @@ def _connected(
         pair = [list(surfaces)[b] for b in around]
         raise InputError(
             f"{path}: bodies {' and '.join(map(repr, pair))} share the node at "
-            f"{_place(points[cells[k, corner]][None])}, but no "
-            f"{'edge' if dim == 2 else 'face'}; expected separate nodes for each body, "
-            f"or a common {'edge' if dim == 2 else 'face'} of cells"
+            f"{place(points[cells[k, corner]][None])}, but no "
+            f"{facet}; expected separate nodes for each body, or a common {facet}"
         )
     return cells[order], surfaces, piece
 
@@ -436,8 +436,8 @@ def _components(one: Nodes, other: Nodes, count: int) -> Nodes:
     return np.asarray(np.argsort(np.argsort(first))[label])
 
 
-def _place(corners: NDArray[np.float64]) -> str:
-    """Return the centre of points (k, dim) as text."""
+def place(corners: NDArray[np.float64]) -> str:
+    """Return the centre of points (k, dim) as text, for messages."""
     return "(" + ", ".join(f"{x:.6g}" for x in corners.mean(axis=0)) + ")"
 
 
@@ -494,18 +494,18 @@ def _counter_clockwise(
     reversed_ = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
     cells = np.where(twice_area[:, None] < 0, reversed_, cells)
     if (flat := twice_area == 0).any():
-        place = _place(points[cells[flat.argmax()]])
+        where = place(points[cells[flat.argmax()]])
         raise InputError(
-            f"{path}: the cell around {place} has no area; expected "
+            f"{path}: the cell around {where} has no area; expected "
             "distinct corners, in their order around the cell"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
     # the boundary of a convex cell turns left at every corner
     corners = cross(np.roll(edges, 1, axis=1), edges)
     if (bad := ((corners <= 0) & ~triangle).any(axis=1)).any():
-        place = _place(points[cells[bad.argmax()]])
+        where = place(points[cells[bad.argmax()]])
         raise InputError(
-            f"{path}: the cell around {place} is not convex; "
+            f"{path}: the cell around {where} is not convex; "
             "expected interior angles below 180°"
         )
     return cells
@@ -521,9 +521,9 @@ def _right_handed(path: Path | str, points: NDArray[np.float64], cells: Nodes) -
         det = np.linalg.det(J)
         mirrored = (det < 0).all(axis=1)
         if (bad := ~mirrored & (det <= 0).any(axis=1)).any():
-            place = _place(points[block.nodes[bad.argmax()]])
+            where = place(points[block.nodes[bad.argmax()]])
             raise InputError(
-                f"{path}: the {block.kind} around {place} has no "
+                f"{path}: the {block.kind} around {where} has no "
                 "volume or folds over; expected distinct corners, in gmsh's order"
             )
         nodes = block.nodes[mirrored][:, _MIRRORED[block.kind]]

@@ -11,7 +11,7 @@ from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import certify
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.gmsh_files import msh22, square, stacked_mesh
+from tests.support.gmsh_files import msh22, solids22, square, stacked_mesh
 from tests.support.solid_blocks import solid_blocks
 
 E, NU = 1e9, 0.3
@@ -509,6 +509,33 @@ def test_a_crack_and_triangles_that_lock_are_remarked(tmp_path, monkeypatch):
     assert remarks(points, halves, sides, kind=2) == ()
     (note,) = remarks(points, halves, sides, nu=0.49, kind=2)
     assert "linear triangles or tetrahedra, which are too stiff for nu = 0.49" in note
+
+
+@pytest.mark.parametrize(("height", "folds"), [(0.3, True), (2.0, False)])
+def test_a_contact_side_around_a_sharp_edge_is_remarked(
+    tmp_path, monkeypatch, height, folds
+):
+    """The side consists of two faces of a wedge, which meet at an edge."""
+    monkeypatch.chdir(tmp_path)
+    triangle = np.array([[0, 0, 0], [1, 0, 0], [1, 0, height]])
+    points = np.vstack([triangle, triangle + [0, 1, 0]])
+    faces = {"slave": [[0, 1, 4, 3], [0, 2, 5, 3]], "end": [[1, 2, 5, 4]]}
+    Path("m.msh").write_text(solids22(points, {"a": [[0, 1, 2, 3, 4, 5]]}, faces))
+    Path("a.toml").write_text(
+        """\
+mesh = "m.msh"
+steps = 1
+bodies = [{ name = "a", E = 1e9, nu = 0.3 }]
+supports = [{ boundary = "end", fix = ["x", "y"] }]
+loads = [{ boundary = "end", force = [0, 0, -1] }]
+[[contacts]]
+slave = "slave"
+rigid = { shape = "plane", point = [0, 0, 0], normal = [0, 0, 1] }
+"""
+    )
+    case = parse("bodies:a.toml/dual", PROBLEMS).build(reference_solution)
+    assert len(case.remarks) == folds
+    assert not folds or "a contact side is folded at (0, 0.5, 0) m" in case.remarks[0]
 
 
 @pytest.mark.parametrize(
