@@ -229,8 +229,7 @@ def contact_case(
             factorise=supported,
             mesh_size=bodies.mesh_size,
             rigid=bodies.rigid,
-            # the columns of `rigid` belong to pieces only if no spring resists them
-            names=() if bodies.springs is not None else bodies.piece_names,
+            names=bodies.piece_names,
             scale=energy,
             constant=energy * float(lift @ (0.5 * (primal.P @ lift) + primal.q)),
             grid=Grid(

@@ -249,6 +249,9 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     )
     with located(str(path)):
         entries = [_entry_of(described, name, file) for name in named.surfaces]
+        used = {*named.surfaces, *map(file.set_of, named.surfaces)}
+        for name in described.keys() - used:
+            raise unknown(file.words.body, name, used, where="bodies")
         supports = _each(table, "supports", lambda entry: _support(entry, named))
         held, moved = _prescribed(supports)
         pairs = _each(table, "contacts", lambda entry: _pair(entry, named))

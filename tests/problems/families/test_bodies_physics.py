@@ -518,7 +518,7 @@ def test_a_contact_side_around_a_sharp_edge_is_remarked(
     """The side consists of two faces of a wedge, which meet at an edge."""
     monkeypatch.chdir(tmp_path)
     triangle = np.array([[0, 0, 0], [1, 0, 0], [1, 0, height]])
-    points = np.vstack([triangle, triangle + [0, 1, 0]])
+    points = np.vstack([triangle, np.add(triangle, [0, 1, 0])])
     faces = {"slave": [[0, 1, 4, 3], [0, 2, 5, 3]], "end": [[1, 2, 5, 4]]}
     Path("m.msh").write_text(solids22(points, {"a": [[0, 1, 2, 3, 4, 5]]}, faces))
     Path("a.toml").write_text(

@@ -666,8 +666,8 @@ def bent(points):
          "the node at (1, 1), but no edge; expected separate nodes for each body, or a "
          "common edge"),
         (lambda p, c: (p, {"a": c[[0, 3]]}, {}, {}), "bodies 'a.1' and 'a.2' share"),
-        (lambda p, c: (p, {"a": np.vstack([c, [[0, 1, 5, 4]]])}, {}, {}), "more than two"
-         " cells share the edge around (1.5, 1); expected cells that do not"),
+        (lambda p, c: (p, {"a": np.vstack([c, [[0, 1, 5, 4]]])}, {}, {}), "more than "
+         "two cells share the edge around (1.5, 1); expected cells that do not"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),
         (lambda p, c: (p, {"a": c}, {"m": [[1, 4]]}, {}), "curve 'm' has an edge that"),
         (lambda p, c: (p + [[0, 0, 1]] * (p[:, :1] > 1), {"a": c}, {}, {}), "same z"),
