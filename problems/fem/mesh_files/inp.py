@@ -473,7 +473,7 @@ def _elements(
 ) -> tuple[_Elements, _Sets]:
     """Return all elements, and the element sets that *ELEMENT defines."""
     tables: dict[str, list[Nodes]] = {}
-    named = []
+    named, flat = [], []
     for section in sections:
         if section.keyword != "ELEMENT":
             continue
@@ -487,6 +487,7 @@ def _elements(
                 "it under *NODE"
             )
         tables.setdefault(kind, []).append(table)
+        flat += [(section, table)] if DIMENSION[kind] < 3 else []
         if section.params.get("ELSET", ""):
             named.append((section.name("ELSET"), table[:, 0]))
     if not tables:
@@ -497,6 +498,14 @@ def _elements(
     sets = _Sets(_distinct(number, "element"), scopes, limit)
     for name, members in named:
         sets.extend(name, members)
+    of_solids = [v[:, 1:].ravel() for k, v in whole.items() if DIMENSION[k] == 3]
+    for section, table in flat if of_solids else ():
+        if not np.isin(table[:, 1:], np.concatenate(of_solids)).all():
+            raise InputError(
+                f"line {section.line}: elements of type {section.params['TYPE']} "
+                "(shells, membranes or trusses) apart from the solids; expected such "
+                "elements on faces of solids only"
+            )
     sizes = [len(table) for table in whole.values()]
     return _Elements(
         cells={k: np.searchsorted(nodes, table[:, 1:]) for k, table in whole.items()},

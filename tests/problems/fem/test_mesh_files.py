@@ -191,6 +191,8 @@ def test_sets_that_overlap_the_described_bodies_are_not_needed(tmp_path):
         ("*Node", "*Instance, name=i, part=p\n*Node", "line 1: unknown part 'p'; kno"),
         ("*Node", "*System\n0,0,1\n*Node", "line 1: *SYSTEM: it generates or moves no"),
         ("*Node", "*Node, system=C", "line 1: *NODE: it generates or moves nodes or"),
+        ("*Element", "9, 9, 9, 9\n*Element, type=S3\n7, 1, 2, 9\n*Element", "line 11: "
+         "elements of type S3 (shells, membranes or trusses) apart from the solids; "),
         (", 4, 5, 6, 7, 8", ", 4", "line 11: an element with 4 nodes; C3D8 has 8"),
         ("1, 0, 0, 0", "1, 0, 0x, 0", "line 2: '0x'; expected a number"),
         ("5, 1,", "5, 99,", "element 5 refers to node 99, which is not in the file"),
