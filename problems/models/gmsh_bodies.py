@@ -104,6 +104,17 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
             f"{p['path']}: nothing stresses the bodies; expected a load, gravity, a "
             "displacement, or contact sides that overlap (a press fit)"
         )
+    if whole.lift is not None:
+        rows = keyed_linearisation(p)(whole, laws)(np.zeros(whole.mesh.dofs))
+        kept = without_fixed(rows, elastic.fixed).place
+        depth = (rows.B @ whole.lift * whole.length - rows.c)[
+            ~np.isin(rows.place, kept)
+        ]
+        if depth.max(initial=0.0) > COINCIDENCE * whole.length:
+            raise InputError(
+                f"{p['path']}: supports move both sides of a contact {depth.max():.3g} "
+                "m into each other; expected displacements that leave a side free"
+            )
     stages = load_steps(
         p["steps"],
         p["relin"],

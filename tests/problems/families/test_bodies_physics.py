@@ -249,6 +249,17 @@ def test_interference_is_a_load(column):
         column(more)
 
 
+def test_supports_that_press_both_sides_into_each_other_are_refused(column):
+    more = '[[supports]]\nboundary = "table"\nfix = "all"\n[[supports]]\n'
+    for move in (-0.01, 0.01):
+        more_ = f'{more}boundary = "foot"\ndisplacement = [0, {move}]\n'
+        if move > 0:
+            assert column(more_)[2]["active"] == 0
+            continue
+        with pytest.raises(InputError, match=r"both sides of a contact 0\.01 m into"):
+            column(more_)
+
+
 def ring(radii, n, name, first, angle=np.pi / 2):
     """Return points, cells and sides of a sector of a ring with n × 2n cells."""
     r = radii[0] + (radii[1] - radii[0]) * np.arange(n + 1) / n
