@@ -32,11 +32,9 @@ ROUNDING = 1e-12  #: relative rounding error of a curvature
 class AcceleratedGradient:
     """In-house accelerated projected gradient method (APGD).
 
-    The iteration stops when the norm of the natural map is at most tol·‖q‖. If a KKT
-    residual exceeds 5·tol at this point, the iteration continues with a smaller bound.
-    The solver claims a solution only if all KKT residuals are at most 5·tol. It starts
-    from the feasible point nearest to zero. It reports the number of steps as
-    iterations, and counts all products with P.
+    The iteration stops when the norm of the natural map is at most tol·‖q‖ and the
+    relative KKT residual is at most tol. It starts from the feasible point nearest to
+    zero. It reports the number of steps as iterations, and counts all products with P.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)

@@ -67,10 +67,9 @@ class FETI:
     """In-house FETI: projected preconditioned CG that stores all directions.
 
     The iteration stops when the gradient Px + q, projected onto the kernel of the
-    equality rows, is at most tol times its initial value. If the relative KKT residual
-    exceeds tol at this point, the iteration continues with a smaller bound. The solver
-    claims a solution only if the relative KKT residual is at most tol. It reports the
-    number of CG steps as iterations, and counts all products with the Hessian P.
+    equality rows, is at most tol times its initial value and the relative KKT residual
+    is at most tol. The solver reports the number of CG steps as iterations, and counts
+    all products with the Hessian P.
     """
 
     #: preconditioner M; "auto" selects "dirichlet" if P provides it, otherwise "none"

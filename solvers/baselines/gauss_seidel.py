@@ -43,10 +43,9 @@ class GaussSeidel:
     """In-house projected Gauss–Seidel method (NSGS).
 
     The iteration stops when the norm of the natural map after a sweep is at most
-    tol·‖q‖. If a KKT residual exceeds 5·tol at this point, the iteration continues with
-    a smaller bound. The solver claims a solution only if all KKT residuals are at most
-    5·tol. It starts from the feasible point nearest to zero. It reports the number of
-    sweeps as iterations; a sweep costs about as much as one product with P.
+    tol·‖q‖ and the relative KKT residual is at most tol. It starts from the feasible
+    point nearest to zero. It reports the number of sweeps as iterations; a sweep costs
+    about as much as one product with P.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)

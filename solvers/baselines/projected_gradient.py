@@ -52,12 +52,10 @@ SUFFICIENT_DECREASE = 1e-4  #: fraction of the linear decrease that a step must 
 class ProjectedGradient:
     """In-house spectral projected gradient method.
 
-    The iteration stops when the norm of the natural map is at most tol·‖q‖. If a KKT
-    residual exceeds 5·tol at this point, the iteration continues with a smaller bound.
-    The solver claims a solution only if all KKT residuals are at most 5·tol. It starts
-    from the feasible point nearest to zero, and the first α is the length of an exact
-    line search. The solver reports the number of steps as iterations, and counts all
-    products with P.
+    The iteration stops when the norm of the natural map is at most tol·‖q‖ and the
+    relative KKT residual is at most tol. It starts from the feasible point nearest to
+    zero, and the first α is the length of an exact line search. The solver reports the
+    number of steps as iterations, and counts all products with P.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)

@@ -14,9 +14,10 @@ Xⱼ = max(‖√D x‖∞, tol·F)/√Dⱼ, a point solves a QP to the toleranc
 
 The terms tol·F and tol·F² replace an absolute tolerance: if the solution is x = 0, the
 other scales vanish, and a residual r of size tol·F√D moves x by tol·F/√D. If Px and q
-are rounding errors, F is ‖√D x‖∞. Rounding errors of r and of the gap are subtracted,
-but at most `tol` times the scale. Multipliers with a wrong sign count as zero. The file
-solvers/smalbe/stopping.pxi contains the same test for bounds and equality rows.
+are rounding errors, F is ‖√D x‖∞, or 1 for P = 0. Rounding errors of r and of the gap
+are subtracted, but at most `tol` times the scale. Multipliers with a wrong sign count
+as zero. The file solvers/smalbe/stopping.pxi contains the same test for bounds and
+equality rows.
 """
 
 from __future__ import annotations
@@ -59,10 +60,10 @@ def relative_residual(qp: QP, s: Solution, tol: float) -> float:
     x, y, z, z_box = s.x, s.y, np.maximum(s.z, 0), admissible(qp.sets, s.z_box)
     Px, root, eps = qp.P @ x, np.sqrt(curvatures(qp)), ROUNDING * np.finfo(x.dtype).eps
     force, size = max(_sup(Px / root), _sup(qp.q / root)), _sup(root * x)
+    is_curved = _diagonal(qp).any()
     if force <= eps * size:
-        force = size
-    force = force or 1.0  # only rows and multipliers have a scale
-    least = tol * force if _diagonal(qp).any() else 0.0
+        force = size if is_curved else 1.0
+    least = tol * force if is_curved else 0.0
     X = max(size, least) / root
     r, errors = Px + qp.q + z_box, []
     if y.size:

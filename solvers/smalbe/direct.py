@@ -46,8 +46,8 @@ DELTA = 1e-10  #: weight δ of the proximal term
 class Direct:
     """In-house SMALBE for small problems, with updated Cholesky factors of faces.
 
-    The loop ends when all KKT residuals of the QP are at most `tol`, or when they no
-    longer decrease. The solver claims a solution if all residuals are at most 5·tol.
+    The loop ends when the relative KKT residual of the QP is at most tol. If the
+    residual no longer decreases, the solver reports an iteration limit.
     """
 
     max_solves: int = 10_000  #: largest total number of solves with factors of faces
@@ -190,7 +190,7 @@ def _penalised(faces: Faces, most: float) -> float:
 def _claimed(
     task: _Task, point: _Point | None, tol: float, otherwise: str, outer: int
 ) -> Solution:
-    """Return the final point, with status SOLVED if its KKT residual is ≤ 5·tol.
+    """Return the final point, with status SOLVED if its KKT residual is ≤ tol.
 
     otherwise : message if the point is not a solution
     """

@@ -42,8 +42,9 @@ class SMALBE(Options):
 
     `tol` bounds ‖g^P‖/‖b‖, where g^P is the projected gradient of the projected
     problem, and ‖Gx − e‖/‖e‖. For QPs with bounds only and a known diagonal of P, the
-    default options test the KKT residuals instead. The solver claims a solution only if
-    the KKT residuals of the original QP are also at most 5·tol.
+    default options test the relative KKT residual instead. The solver claims a solution
+    only if the relative KKT residual of the original QP is also at most tol; for the
+    presets with published rules, at most 5·tol.
     """
 
     about: ClassVar[About] = About(

@@ -16,11 +16,11 @@ cdef double worst_ratio(
 
     sums, most : results of `terms_of_test`; on return, most[2] is the size of all
         scaled variables
+    tol : the tolerance, 0 if P has no known diagonal
     """
     cdef double rounding = 8 * 2.0 ** -52, size = most[2], force = most[1], energy
     if force <= rounding * size:
-        force = size
-    force = force if force else 1.0
+        force = size if tol > 0 else 1.0
     energy = fmax(fmax(fabs(sums[0]), fabs(sums[1])), tol * force * force)
     energy = energy if energy else force * size
     most[2] = fmax(size, tol * force)
