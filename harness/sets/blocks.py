@@ -94,7 +94,7 @@ class Blocks(ABC):
 
     @abstractmethod
     def normals(self, x: Vector) -> tuple[csc_array, Vector]:
-        """Return outward unit normals (n, j) at x (n,), and the slack (j,) of each.
+        """Return outward normals (n, j) at x (n,) of length ≤ 1, and their slacks (j,).
 
         Nonnegative combinations of the normals with zero slack span the normal cones,
         up to the discretisation of curved cones.

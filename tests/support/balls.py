@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mortarbench.harness.sets.convex import Limits, Sum
+from mortarbench.harness.sets.convex import Limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,8 @@ class Balls:
 
     def limits(self, x):
         norms = self._norms(x)
-        return [Limits(self.radius - norms, self.radius, norms, self._norms)]
+        first = self.index[:, 0]
+        return [Limits("ball", self.radius - norms, self.radius, norms, first)]
 
     def admissible(self, z):
         borne = np.zeros_like(z)
@@ -47,13 +48,10 @@ class Balls:
         return borne
 
     def support(self, z):
-        value = self.radius @ self._norms(z)
-        return Sum(value, value)
+        return float(self.radius @ self._norms(z))
 
     def support_gaps(self, x, z, limits):
-        work = (z * x)[self.index]
-        value = self.radius * self._norms(z)
-        return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
+        return [self.radius * self._norms(z) - (z * x)[self.index].sum(axis=1)]
 
     def substituted(self, T, a):
         """Return the balls in the variables y of x = T y + a.

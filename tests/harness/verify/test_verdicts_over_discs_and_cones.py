@@ -20,26 +20,21 @@ from mortarbench.harness.conformance.metamorphic import (
     permute_unknowns,
     shift_unknowns,
 )
-from mortarbench.harness.verify.kkt import ROUNDING, kkt_residuals, normality, own_sizes
+from mortarbench.harness.verify.kkt import allowed, kkt_residuals, normality
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.registries import Registries
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.harness.verify.test_optimum_over_sets import (
-    PAIRS,
-    AttackOverSets,
-    exact_objective,
-)
+from tests.support.rational import rational
 
+PAIRS = [(3, 4, 5), (5, 12, 13), (8, 15, 17), (-7, 24, 25), (4, -3, 5)]
 INF = np.inf
 #: traps, which are tested singly and in pairs
 TRAPS = (
-    "tiny", "wide", "point", "flat", "steep", "no friction", "apex", "degenerate",
-    "touching", "singular", "cancelled", "weak", "units",
+    "tiny", "small", "wide", "point", "flat", "steep", "no friction", "apex",
+    "degenerate", "touching", "singular", "cancelled", "weak", "units",
 )  # fmt: skip
-SMALL, LARGE = (
-    2.0**-27,
-    2.0**27,
-)  #: radii of about 1e∓8, combined with radii of order one
+#: units of a radius that is combined with radii of order one
+UNITS = {"tiny": 2.0**-27, "small": 2.0**-8, "wide": 2.0**27}
 FLAT, STEEP = 2.0**-16, 2.0**16  #: slopes for which all sums are exact
 
 
@@ -105,7 +100,7 @@ class ExactProblem:
     def disc(self, block, traps):
         """Plant a solution on or inside a disc; return its radius."""
         at, radius = self.pair()
-        unit = SMALL if "tiny" in traps else LARGE if "wide" in traps else 1.0
+        unit = next((UNITS[trap] for trap in UNITS if trap in traps), 1.0)
         if "point" in traps:  # any force is normal
             self.z[block] = self.rng.integers(-9, 10, 2)
             return 0.0
@@ -180,53 +175,114 @@ def test_planted_points_are_solutions_to_the_last_digit(trap):
         assert kkt_residuals(qp, s).worst <= 1e-14
 
 
-class AttackOnBlocks(AttackOverSets):
-    """Attack with moves along boundaries of discs and cones, and balanced
-    multipliers.
-    """
+def exact_objective(qp, x):
+    P, q, x = rational(qp.P), rational(qp.q), rational(x)
+    return x @ (P @ x) / 2 + q @ x
 
-    def violation(self, x, at):
-        """Return the largest violation of a row, bound or disc, relative to its terms.
 
-        Rows, bounds and cones through the origin are omitted: they define no length.
+class Attack:
+    """Points of a planted QP: solutions up to rounding, and moves away from one."""
+
+    def __init__(self, planted, rng):
+        self.qp, self.s, self.rng = planted.qp, planted.solution, rng
+        self.value, x = np.longdouble(planted.value), self.s.x
+        self.length = np.abs(x).max()
+        self.terms = max(
+            abs(x @ (self.qp.P @ x)),
+            np.abs(self.qp.q) @ np.abs(x),
+            1e-3 * np.abs(self.qp.P).max() * self.length**2,
+            1e-3 * np.abs(self.qp.q).max() * self.length,
+        )
+
+    def error(self, x):
+        """Return the larger of the errors of the objective and of the constraints.
+
+        Constraints are relative to their terms; those without a unit of their own
+        (right-hand side, bound or radius 0, and cones), to 0.1‖x*‖∞.
         """
-        qp, own = self.qp, np.maximum(own_sizes(self.qp, self.s.x) / 10, at)
-        limits = [
-            (abs(qp.A @ x - qp.b), abs(qp.b), abs(qp.A) @ own),
-            (qp.G @ x - qp.h, abs(qp.h), abs(qp.G) @ own),
-        ]
+        qp, x = self.qp, x.astype(np.longdouble)
+        worst = abs(float(x @ (qp.P @ x) / 2 + qp.q @ x - self.value)) / self.terms
+        x = x.astype(float)
+        size = np.maximum(np.abs(x), np.abs(self.s.x))
+        rows = [
+            (off, np.abs(rhs), np.abs(M) @ size, np.abs(M).max(axis=1))
+            for off, M, rhs in (
+                (np.abs(qp.A @ x - qp.b), qp.A, qp.b), (qp.G @ x - qp.h, qp.G, qp.h)
+            )
+        ]  # fmt: skip
         for one in qp.sets:
-            limits += [(-l.slack, l.size, l.sized(own)) for l in one.limits(x)]
-        worst = 0.0
-        for off, size, terms in limits:
-            if not self.is_unique:
-                off = off - ROUNDING * (size + terms)
-            has_length = size > 0
-            worst = max(worst, (off / (size + terms))[has_length].max(initial=0.0))
+            for here, there in zip(one.limits(x), one.limits(self.s.x), strict=True):
+                terms = np.maximum(here.terms, there.terms)
+                rows.append((-here.slack, here.size, terms, np.ones(terms.size)))
+        for off, own, terms, largest in rows:
+            least = np.where(own > 0, 1e-3, 0.1) * self.length * largest
+            ratio = off / np.maximum(own + terms, np.maximum(least, 1e-300))
+            worst = max(worst, ratio.max(initial=0.0))
         return worst
 
-    def moved(self, s):
+    def rounded(self, tol):
+        """Return the solution, disturbed by nothing, two units or 0.1·tol."""
+        size = self.rng.choice([0, 2.0**-52, 0.1 * tol])
+
+        def off(v):
+            return v * (1 + size * self.rng.uniform(-1, 1, v.size))
+
+        x, y, z, z_box = map(off, (self.s.x, self.s.y, self.s.z, self.s.z_box))
+        return replace(self.s, x=self.project(x), y=y, z=z, z_box=z_box)
+
+    def moved(self, s, tol):
+        rng, x = self.rng, s.x
+        unit = np.where(x != 0, np.abs(x), self.length)
+        size = 10 ** rng.uniform(np.log10(tol) - 1, 0.5)
+        match rng.integers(0, 6):
+            case 0:  # one variable
+                here = np.arange(x.size) == rng.integers(x.size)
+                x = x + size * unit * rng.standard_normal() * here
+            case 1:  # all variables
+                x = x + size * unit * rng.standard_normal(x.size)
+            case 2:  # along active rows
+                x = x + size * self.along_rows(x, unit * rng.standard_normal(x.size))
+            case 3:  # along the boundary of a disc or cone
+                x = self.turned(x, size)
+            case 4:  # another vertex
+                x = np.where(rng.random(x.size) < 0.3, 0, x)
+        x = self.project(x) if rng.random() < 0.6 else x
+        return self.with_multipliers(replace(s, x=x), size)
+
+    def with_multipliers(self, s, size):
+        """Return `s` with other multipliers in five of six cases."""
         rng, qp = self.rng, self.qp
-        if rng.random() < 0.6:
-            s = super(AttackOverSets, self).moved(s)
-        if rng.random() < 0.5:
-            s = replace(s, x=self.project(s.x))
-        if rng.random() < 0.02:  # expensive
-            s = with_multipliers(qp, s.x)
-        if rng.random() < 0.5:
-            s = replace(s, x=self.turned(s.x, 10 ** rng.uniform(-9, 0.5)))
-        choice = rng.random()
-        if choice < 0.5:  # stationary up to rounding, perhaps not normal
-            block = np.zeros(qp.q.size, dtype=bool)
-            for one in qp.sets[1:]:
-                block[one.block] = True
-            force = qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z
-            s = replace(s, z_box=np.where(block, -force, s.z_box))
-        elif choice < 0.6:
-            s = replace(s, z_box=self.turned(s.z_box, 10 ** rng.uniform(-9, 0.5)))
-        elif choice < 0.65:  # the wrong sign, and the gradient reversed
-            s = replace(s, z_box=-s.z_box)
-        return s
+        angle = 10 ** rng.uniform(-9, 0.5)
+        match rng.integers(0, 6):
+            case 0:
+                return with_multipliers(qp, s.x) if rng.random() < 0.05 else s
+            case 1 | 2:  # stationary up to rounding, perhaps not normal
+                block = np.zeros(qp.q.size, dtype=bool)
+                for one in qp.sets[1:]:
+                    block[one.block] = True
+                force = qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z
+                return replace(s, z_box=np.where(block, -force, s.z_box))
+            case 3:
+                return replace(s, z_box=self.turned(s.z_box, angle))
+            case 4:  # the wrong sign
+                return replace(s, z_box=-s.z_box) if rng.random() < 0.3 else s
+            case _:
+                y, z, z_box = (
+                    v * (1 + size * rng.standard_normal(v.size))
+                    for v in (s.y, s.z, s.z_box)
+                )
+                return replace(s, y=y, z=z, z_box=z_box)
+
+    def along_rows(self, x, step):
+        qp = self.qp
+        tight = qp.h - qp.G @ x <= 1e-9 * (abs(qp.h) + abs(qp.G) @ abs(x))
+        B = np.vstack([qp.A, qp.G[tight]])
+        return step - np.linalg.pinv(B) @ (B @ step) if B.size else step
+
+    def project(self, x):
+        for one in self.qp.sets:
+            x = one.project(x)
+        return x
 
     def turned(self, v, angle):
         """Rotate the tangential components of one block."""
@@ -238,70 +294,66 @@ class AttackOnBlocks(AttackOverSets):
         return v
 
 
-def search(seed, tries, each=200, traps=None):
-    """Attack QPs with up to two traps; return wrong verdicts and counts."""
-    rng = np.random.default_rng(seed)
-    wrong, refuted, verified, proven = [], [], 0, 0
-    with np.errstate(all="ignore"):
-        for _ in range(tries // each):
-            some = {str(t) for t in rng.choice(TRAPS, rng.integers(0, 3))}
-            some = some if traps is None else traps
-            number = int(rng.integers(2**30))
-            planted = ExactProblem(some, number)
-            attack = AttackOnBlocks(
-                planted, rng, is_unique=not some & {"singular", "weak"}
-            )
-            optimum = attack.prove(planted.qp)
-            if optimum is not None:
-                proven += 1
-                off = abs(Fraction(optimum.value) - planted.exact)
-                assert off <= optimum.doubt, (some, number)
-            for _ in range(3):
-                s = attack.rounded()
-                if attack.error(s) < 1e-9 and not attack.verified(s):
-                    refuted.append((sorted(some), number))
-            for s in attack.points(each - 3):
-                if attack.verified(s):
-                    verified += 1
-                    is_wrong = optimum is not None and attack.is_wrong(s)
-                    if attack.error(s) > 1e-3 or is_wrong:
-                        wrong.append((sorted(some), number, s, optimum is not None))
-    return wrong, refuted, verified, proven / (tries // each)
+def search(seed, tries, each=50):
+    """Return the wrong verdicts on points of QPs with up to two traps, and counts.
+
+    A point is right if it is planted up to 0.1·tol and its error is at most tol, and
+    wrong if its error exceeds 100·tol. Every third move starts from the worst point
+    that was verified.
+    """
+    rng, count = np.random.default_rng(seed), {"right": 0, "wrong": 0}
+    verified, refuted = [], []
+    for k in range(tries // each):
+        traps = {str(t) for t in rng.choice(TRAPS, rng.integers(0, 3))}
+        number, tol = int(rng.integers(2**30)), (1e-8, 1e-6, 1e-4)[k % 3]
+        attack = Attack(ExactProblem(traps, number), rng)
+        worst, most = attack.s, 0.0
+        for i in range(each):
+            planted = i % 10 == 0
+            start = worst if i % 3 == 2 else attack.s
+            s = attack.rounded(tol) if planted else attack.moved(start, tol)
+            error = attack.error(s.x)
+            passed = kkt_residuals(attack.qp, s).worst <= allowed(tol)
+            if planted and error <= tol:
+                count["right"] += 1
+                refuted += [] if passed else [(sorted(traps), number, tol, s)]
+            if error > 100 * tol:
+                count["wrong"] += 1
+                verified += [(sorted(traps), number, tol, s)] if passed else []
+            if passed and not planted and error > most:
+                worst, most = s, error
+    return verified, refuted, count
 
 
 @pytest.mark.parametrize(
-    ("tries", "each", "least"),
-    [(60, 20, 5), pytest.param(120, 40, 10, marks=pytest.mark.slow)],
+    ("seed", "tries"), [(2, 1500), pytest.param(3, 25_000, marks=pytest.mark.slow)]
 )
-def test_no_verdict_is_wrong_in_a_short_search(tries, each, least):
-    wrong, refuted, verified, proven = search(271828, tries, each)
+def test_few_points_of_a_search_are_judged_wrongly(seed, tries):
+    """At tol 1e-4, weak directions of steep and flat cones hide an energy."""
+    with np.errstate(all="ignore"):
+        verified, refuted, count = search(seed, tries)
 
-    assert (wrong, refuted) == ([], [])
-    assert verified > least
-    assert proven > 0.8
-
-
-@pytest.mark.slow
-def test_no_verdict_is_wrong_on_a_hundred_thousand_points():
-    wrong, refuted, verified, proven = search(314159, 100_000)
-
-    assert (wrong, refuted) == ([], [])
-    assert verified > 10_000
-    assert proven > 0.8
+    assert count["right"] > 0.09 * tries
+    assert count["wrong"] > 0.3 * tries
+    assert len(verified) <= 0.004 * count["wrong"]
+    assert len(refuted) <= 0.004 * count["right"]
+    assert all({"steep", "flat", "singular", "weak"} & {*t} for t, *_ in verified)
 
 
-@pytest.mark.slow
-def test_residuals_alone_yield_no_wrong_verdict_without_traps():
-    """At points with residuals of at most 1e-7, the error of f is at most 1e-6."""
-    rng, verified = np.random.default_rng(161803), 0
-    for _ in range(200):
-        planted = ExactProblem(set(), int(rng.integers(2**30)))
-        attack = AttackOnBlocks(planted, rng)
-        for s in attack.points(200):
-            if kkt_residuals(planted.qp, s).worst <= 1e-7:
-                verified += 1
-                assert attack.error(s) <= 1e-6
-    assert verified > 5_000
+@pytest.mark.parametrize("tol", [1e-8, 1e-4])
+@pytest.mark.parametrize("trap", ["", "small", "weak", "units"])
+def test_a_point_outside_a_disc_by_a_hundred_tolerances_is_refuted(trap, tol):
+    """Radii are at least 1e-4 of the length of x; moves are radial."""
+    for seed in range(20):
+        planted = ExactProblem({trap, "singular"}, seed)
+        qp, s = planted.qp, planted.solution
+        for one in qp.sets[1:]:
+            if not isinstance(one, Discs):
+                continue
+            for block, radius in zip(one.index, one.radius, strict=True):
+                x = s.x.copy()
+                x[block] *= (1 + 100 * tol) * radius / np.linalg.norm(x[block])
+                assert kkt_residuals(qp, replace(s, x=x)).primal > allowed(tol)
 
 
 @pytest.mark.parametrize("trap", ["", "tiny", "units"])
