@@ -30,11 +30,12 @@ from mortarbench.harness.conformance.manufactured import (
     strings,
 )
 from mortarbench.harness.conformance.weaknesses import line_of
+from mortarbench.harness.verify import measure
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import DeclinedError
 from mortarbench.solvers import SOLVERS
 from mortarbench.validation import Conformance
-from tests.support import FAULTY_SOLVERS, ROOT
+from tests.support import FAULTY_SOLVERS, ROOT, faulty_solvers
 from tests.support.faulty_solvers import (
     MEMORIES,
     MEMORY,
@@ -276,6 +277,18 @@ def test_a_check_catches_its_fault(kind, check):
     assert run_check(check, kind()).grade is Grade.FAIL
 
 
+@pytest.fixture
+def clock(monkeypatch):
+    """Let solves take 10 ms, and further work the requested time, on any machine."""
+    now = [0.0]
+
+    def work(seconds):
+        now[0] += seconds or 0.01
+
+    monkeypatch.setattr(faulty_solvers, "work", work)
+    monkeypatch.setattr(measure, "perf_counter", lambda: now[0])
+
+
 ANOTHER = "returned the answer of another QP of the same shape"
 AGAIN = "the second solve of a QP took .* s, solves of other QPs of the same shape"
 
@@ -291,6 +304,7 @@ AGAIN = "the second solve of a QP took .* s, solves of other QPs of the same sha
     ],
 )
 @pytest.mark.parametrize("check", ["bounds", "equalities"])
+@pytest.mark.usefixtures("clock")
 def test_a_solver_that_remembers_answers_is_named(kind, message, check):
     MEMORIES.clear()
     result = run_check(f"remembers no answer: {check}", kind())
@@ -299,6 +313,7 @@ def test_a_solver_that_remembers_answers_is_named(kind, message, check):
 
 
 @pytest.mark.parametrize("kind", [Sound, Compiles, CompilesOnce, ReusesPatterns])
+@pytest.mark.usefixtures("clock")
 def test_a_slow_first_call_is_not_accused(kind):
     MEMORIES.clear()
     for check in CHECKS:
@@ -307,6 +322,7 @@ def test_a_slow_first_call_is_not_accused(kind):
             assert grade in (Grade.PASS, Grade.DECLINE), message
 
 
+@pytest.mark.usefixtures("clock")
 def test_answers_of_earlier_sequences_are_not_reused():
     MEMORIES.clear()
     checks = ("remembers no answer: bounds", "remembers no answer: bounds, sequences")

@@ -327,7 +327,7 @@ def test_remembered_answers_are_marked_and_a_slow_first_call_is_not(bench):
         record = bench("compiles")
         assert record.remembered is False
         assert record.message == ""
-        assert record.total_seconds < 0.01
+        assert record.total_seconds < 0.2  # compiling takes 0.3 s
 
 
 @pytest.mark.parametrize("solver", ["diesonothers", "hangsonothers"])
