@@ -623,8 +623,10 @@ def _adjusted(
             near = np.abs(rows.c) <= distance
             nodes = pair.slave_nodes[rows.place[near]]
             at = dofs_of(nodes, dim).reshape(-1, dim)
-            # B contains the unit vector towards the master at the slave node
+            # the entries of B at the slave node point towards the master; they are not
+            # a unit vector if a facet of the node extends beyond the master
             towards = rows.B[np.flatnonzero(near)[:, None], at].toarray()
+            towards /= np.linalg.norm(towards, axis=1, keepdims=True)
             points[nodes] += rows.c[near][:, None] * towards
             if (oriented("adjust", points, named.cells) != named.cells).any():
                 raise InputError("adjust: a cell folds; expected a smaller distance")
