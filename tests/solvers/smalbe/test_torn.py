@@ -90,8 +90,8 @@ def test_calls_of_python_take_the_same_steps(name, tol, monkeypatch):
     monkeypatch.setattr(SparseRows, "on_one_process", False)
     called = SMALBE().prepare(qp, tol)()
 
-    # the plate amplifies rounding: at 1e-9, residuals after equally many steps differ by
-    # up to a half between two orders of summation, or two BLAS libraries
+    # the plate amplifies rounding: at 1e-9, residuals after equally many steps differ
+    # by up to a half between two orders of summation, or two BLAS libraries
     if not (name.startswith("plate") and tol == 1e-9):
         assert called.counts == compiled.counts
     assert called.x == pytest.approx(compiled.x, abs=1e-7 * abs(compiled.x).max())
