@@ -1,12 +1,8 @@
-"""Digests: known values, and digests in a stored result folder."""
+"""Digests: known values."""
 
 from io import BytesIO
-from pathlib import Path
 
 from mortarbench.harness.digest import hex_digest, pieces
-from mortarbench.harness.files.store import digest_of, read_arrays
-
-OLD = Path(__file__).parents[1] / "data" / "results-2026-11"
 
 
 def test_a_digest_is_the_beginning_of_sha_256():
@@ -20,12 +16,3 @@ def test_the_digest_of_a_file_does_not_depend_on_chunk_sizes():
 
     assert hex_digest(pieces(BytesIO(content)), 64) == hex_digest([content], 64)
     assert list(pieces(BytesIO())) == []
-
-
-def test_stored_vectors_have_the_digests_that_they_were_stored_under():
-    stored = list((OLD / "vectors").glob("*.npz"))
-
-    assert stored
-    assert [digest_of(read_arrays(path, ())) for path in stored] == [
-        path.stem for path in stored
-    ]

@@ -21,7 +21,7 @@ from mortarbench.harness.verify.certificate import (
 from mortarbench.harness.verify.verdicts import certified
 from tests.harness.verify.test_verdicts_over_discs_and_cones import (
     TRAPS,
-    AttackOnBlocks,
+    Attack,
     ExactProblem,
 )
 
@@ -71,10 +71,10 @@ def exceeded(seed, tries, each=100):
             traps = {str(t) for t in rng.choice(KEPT, rng.integers(0, 3))}
             number, ill = int(rng.integers(2**30)), bool(rng.random() < 0.3)
             planted = WithoutRows(traps, number, ill)
-            attack = AttackOnBlocks(planted, rng)
-            for k, s in enumerate(attack.points(each)):
-                if k % 10 == 0:
-                    s = replace(s, x=0 * s.x)
+            attack = Attack(planted, rng)
+            for k in range(each):
+                s = attack.moved(planted.solution, 1e-8)
+                s = replace(s, x=0 * s.x) if k % 10 == 0 else s
                 try:
                     bound = certify_by_eigenvalue(planted.qp, s, planted.least).bound
                 except UncertifiableError:
