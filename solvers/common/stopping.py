@@ -14,7 +14,7 @@ Xⱼ = max(‖√D x‖∞, tol·F)/√Dⱼ, a point solves a QP to the toleranc
 
 The terms tol·F and tol·F² replace an absolute tolerance: if the solution is x = 0, the
 other scales vanish, and a residual r of size tol·F√D moves x by tol·F/√D. If Px and q
-are rounding errors, F is ‖√D x‖∞, or 1 for P = 0. Rounding errors of r and of the gap
+are negligible, F is ‖√D x‖∞, or 1 for P = 0. Rounding errors of r and of the gap
 are subtracted, but at most `tol` times the scale. Multipliers with a wrong sign count
 as zero. The file solvers/smalbe/stopping.pxi contains the same test for bounds and
 equality rows.
@@ -32,8 +32,9 @@ from mortarbench.harness.sets.convex import admissible
 #: rounding errors of Px/√D relative to ‖√D x‖∞, and of xᵀPx relative to xᵀDx, in units
 #: of the precision of x
 ROUNDING = 8
-#: diagonal entries of P below this factor times their mean count as zero
-NO_CURVATURE = 1e-12
+#: diagonal entries of P below this factor times their mean count as zero, and so do
+#: forces (q/√D and Px/√D) below this factor times ‖√D x‖∞
+NEGLIGIBLE = 1e-12
 
 
 def curvatures(qp: QP) -> Vector:
@@ -45,7 +46,7 @@ def curvatures(qp: QP) -> Vector:
     if not d.any():
         return d + (np.abs(qp.q).max(initial=0.0) or 1.0)
     usual = d.sum() / np.count_nonzero(d)
-    return np.where(d > NO_CURVATURE * usual, d, usual)
+    return np.where(d > NEGLIGIBLE * usual, d, usual)
 
 
 @np.errstate(all="ignore")  # a point of a failed solve may contain NaN, inf, or 1e300
@@ -61,7 +62,7 @@ def relative_residual(qp: QP, s: Solution, tol: float) -> float:
     Px, root, eps = qp.P @ x, np.sqrt(curvatures(qp)), ROUNDING * np.finfo(x.dtype).eps
     force, size = max(_sup(Px / root), _sup(qp.q / root)), _sup(root * x)
     is_curved = _diagonal(qp).any()
-    if force <= eps * size:
+    if force <= NEGLIGIBLE * size:
         force = size if is_curved else 1.0
     least = tol * force if is_curved else 0.0
     X = max(size, least) / root

@@ -19,7 +19,7 @@ cdef double worst_ratio(
     tol : the tolerance, 0 if P has no known diagonal
     """
     cdef double rounding = 8 * 2.0 ** -52, size = most[2], force = most[1], energy
-    if force <= rounding * size:
+    if force <= 1e-12 * size:
         force = size if tol > 0 else 1.0
     energy = fmax(fmax(fabs(sums[0]), fabs(sums[1])), tol * force * force)
     energy = energy if energy else force * size

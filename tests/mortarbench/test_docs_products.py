@@ -38,7 +38,7 @@ def test_a_count_is_the_one_shown(case, head, shown):
     changes counts of `smalbe` by one, and counts of the presets by a half."""
     count = products.products(case, head)
 
-    if head.startswith("`smalbe"):
+    if head.startswith("`smalbe`"):
         assert abs(count - shown) <= 1
     else:
         assert shown / 1.5 <= count <= 1.5 * shown

@@ -276,12 +276,6 @@ def test_records_contain_the_cost_of_each_rank(answers):
     assert (read.rank_seconds, read.rank_counts) == (seconds, counts)
 
 
-def test_journal_lines_of_one_rank_have_no_fields_of_ranks(answers):
-    _, alone = answers
-    line = json.loads(alone.record.to_json())
-    assert not {"ranks", "rank_seconds", "rank_counts"} & line.keys()
-
-
 @pytest.mark.slow  # `problems/feti/test_distributed.py` tests the refusal of the form
 def test_more_ranks_than_subdomains_are_declined():
     answer = mb.solve("membranes/S=1/n=2/dual", "smalbe", ranks=3)
@@ -539,4 +533,3 @@ def test_records_contain_the_speed_of_communication(answers):
         assert 0 <= mean <= largest < 1
     assert network["reduction_seconds"][0] > 0
     assert alone.record.rank_network == {}
-    assert "rank_network" not in json.loads(alone.record.to_json())

@@ -140,7 +140,9 @@ OUTCOMES = {
     ),
     "spikesunseen": (Verdict.MEMORY_LIMIT, ..., None),
     "forksahoarder": (Verdict.MEMORY_LIMIT, None, None),
-    "wrongsign": (Verdict.WRONG, "solved", ""),
+    "wrongsign": (
+        Verdict.WRONG, "solved", "with −z all residuals vanish: check the sign of z",
+    ),
     "forks": (Verdict.VERIFIED, "solved", ""),
     "wrongshape": (
         Verdict.FAILED, "failed", "Solution.x has shape (3,), expected (2,)",
@@ -148,8 +150,8 @@ OUTCOMES = {
     "returnsnone": (
         Verdict.FAILED, "failed", "returned NoneType, expected Solution",
     ),
-    "returnsnan": (Verdict.WRONG, "solved", ""),
-    "zero": (Verdict.WRONG, "solved", ""),
+    "returnsnan": (Verdict.WRONG, "solved", "x contains NaN"),
+    "zero": (Verdict.WRONG, "solved", None),
     "mutates": (
         Verdict.FAILED, "failed",
         "ValueError: assignment destination is read-only (adversaries.py:389)",

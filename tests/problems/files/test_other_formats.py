@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError
 from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.files.readers import read
 from mortarbench.solvers import SOLVERS
 

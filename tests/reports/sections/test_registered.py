@@ -1,22 +1,17 @@
 """Registration of sections with positions and required measurements."""
 
-from pathlib import Path
-
 import pytest
 
 from mortarbench.reports import sections
-from mortarbench.reports.data.evidence import read_evidence
 from mortarbench.reports.document.layout import Cell, Point, Statement, Table
 from mortarbench.reports.sections import Analysis, section
 
-FOLDER = Path(__file__).parents[2] / "data" / "results-e247e1f-smoke"
-
 
 @pytest.fixture
-def analysis(monkeypatch):
+def analysis(monkeypatch, measured, evidence):
     """Return an analysis; sections that a test registers are removed after the test."""
     monkeypatch.setattr(sections, "_ENTRIES", sections._entries())
-    return Analysis(read_evidence(FOLDER))
+    return Analysis(evidence([measured("osqp"), measured("good")]))
 
 
 def test_a_section_has_a_position_and_sorts_its_parts_by_type(analysis):
