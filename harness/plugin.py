@@ -155,8 +155,8 @@ class ContactSide:
 
     name: str  #: name of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) numbers of the nodes along the side
-    #: (s,) length of the undeformed side attributed to each node, m, or area, m²; only
-    #: parts that the master covers, and 0 at nodes without a pressure of their own
+    #: (s,) length of the undeformed side attributed to each node, m, or area, m²; at
+    #: nodes with a row, the part that the master covers
     length: Vector
     #: (s, dim) force of this contact on each slave node: N/m in 2D, N in 3D
     force: NDArray[Any]

@@ -101,13 +101,14 @@ def contact_sides(
         against = np.zeros(slave.size)  # n · (force on the slave) per unit multiplier
         against[at] = np.einsum("ex,ex->e", along[rows.at[mine]], outward[at])
         # barely covered nodes hand their area and forces over to their neighbours
-        area = np.zeros(slave.size)
-        area[at] = (side.areas * covered[here])[at]
-        kept = (area > 0) & ~barely_covered(area, side.facets, BARELY)
+        has_row = np.isin(np.arange(slave.size), at)
+        area = side.areas * covered[here]
+        kept = has_row & ~barely_covered(area * has_row, side.facets, BARELY)
         E = handed_over(side.facets, kept)
-        area, pressing, shear_force, pushing = (
-            E @ v for v in (area, push[here] * against, shear[here], push[here])
+        pressing, shear_force, pushing = (
+            E @ v for v in (push[here] * against, shear[here], push[here])
         )
+        area = np.where(has_row, E @ (area * has_row), area)
         per_area = np.divide(1.0, area, out=np.zeros_like(area), where=kept)
         sides.append(
             ContactSide(
