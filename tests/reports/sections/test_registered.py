@@ -2,16 +2,28 @@
 
 import pytest
 
+from mortarbench.harness import Record, Verdict
 from mortarbench.reports import sections
+from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.document.layout import Cell, Point, Statement, Table
 from mortarbench.reports.sections import Analysis, section
 
 
 @pytest.fixture
-def analysis(monkeypatch, measured, evidence):
+def analysis(monkeypatch, tmp_path):
     """Return an analysis; sections that a test registers are removed after the test."""
     monkeypatch.setattr(sections, "_ENTRIES", sections._entries())
-    return Analysis(evidence([measured("osqp"), measured("good")]))
+    records = [
+        Record(
+            run_id=solver, case="box/n=1/dual", family="box", params={"n": 1},
+            form="dual", sizes={"variables": 1}, solver=solver, options={}, tol=1e-8,
+            repeat=0, block=0, verdict=Verdict.VERIFIED, claimed="solved",
+            total_seconds=0.003, primal=0.0, dual=0.0, complementarity=0.0, gap=0.0,
+            environment="e", started="2026-11-21T10:00:00+00:00",
+        )
+        for solver in ("one", "two")
+    ]  # fmt: skip
+    return Analysis(Evidence(directory=tmp_path, records=arrange(records)))
 
 
 def test_a_section_has_a_position_and_sorts_its_parts_by_type(analysis):
