@@ -7,12 +7,13 @@ from .mechanics import Grid as Grid
 from .mechanics import Mechanics as Mechanics
 from .plugin import About as About
 from .plugin import Case as Case
+from .plugin import CaseOnRanks as CaseOnRanks
 from .plugin import Chained as Chained
 from .plugin import ContactSide as ContactSide
 from .plugin import Family as Family
 from .plugin import Fields as Fields
 from .plugin import Reference as Reference
-from .plugin import ReferenceOverRanks as ReferenceOverRanks
+from .plugin import ReferenceOfOperator as ReferenceOfOperator
 from .plugin import Solver as Solver
 from .plugin import Tightening as Tightening
 from .plugin import Value as Value

@@ -206,18 +206,6 @@ def unbuilt(name: object, e: BaseException) -> str:
     return " ".join(f"{name} could not be built: {why}".split())
 
 
-def is_shared(name: CaseId) -> bool:
-    """Return True if MPI ranks can assemble the QP of a case, see `Family.emission`.
-
-    The result is False if the family raises an exception. The case is then built by a
-    single process.
-    """
-    try:
-        return name.family.emission(name.form, name.params) is not None
-    except Exception:  # raised by code of the family
-        return False
-
-
 def match(pattern: str, names: Iterable[str]) -> list[str]:
     """Return the canonical `names` that match a shell glob.
 

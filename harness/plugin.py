@@ -6,15 +6,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
-    from mortarbench.harness.mechanics import CellBlock, Mechanics
+    from mortarbench.harness.distributed.comm import Comm, Lead
+    from mortarbench.harness.mechanics import (
+        CellBlock,
+        DecomposedMechanics,
+        Mechanics,
+    )
     from mortarbench.harness.qp import QP, Vector
     from mortarbench.harness.solution import Solution
 
@@ -24,8 +28,8 @@ Value = int | float | str  #: value of a key in a case name
 Reference: TypeAlias = "Callable[[QP], Solution]"
 
 
-class ReferenceOverRanks(Protocol):
-    """Function that solves a distributed QP accurately; all ranks must call it."""
+class ReferenceOfOperator(Protocol):
+    """Function that accurately solves a QP whose P is an operator."""
 
     def __call__(self, qp: QP, start: Solution | None = None, /) -> Solution:
         """Solve a QP to high accuracy.
@@ -254,11 +258,25 @@ class Case:
     #: time to form the dual, including the factorisation; None for other forms
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: elastic problem, needed to certify errors
+    #: maps a solution of the QP to the data of its certificate, if bodies are only
+    #: known by their subdomains: bodies, displacement and multipliers of their rows
+    certifiable: (
+        Callable[[Solution], tuple[DecomposedMechanics, Vector, Vector]] | None
+    ) = None
     remarks: tuple[str, ...] = ()  #: warnings about the input; each is a single line
     #: relative residual of the fixed-point iteration to which the QP belongs, such as
     #: the iteration for Coulomb's law. An accurate solution of this QP does not reduce
     #: the residual. 0 if there is no iteration
     unsettled: float = 0.0
+
+
+class CaseOnRanks(NamedTuple):
+    """A case that several ranks have built together."""
+
+    served: Any  #: objects on this rank whose methods rank 0 calls on all ranks
+    digest: str  #: digest of the QP, independent of the number of ranks
+    #: returns the case on rank 0, while the other ranks serve
+    case: Callable[[Lead], Case]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -368,14 +386,20 @@ class Family(ABC):
         """Return the paths of the copied files, see `with_copies`."""
         return []
 
-    def emission(
-        self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
-        """Return a function that assembles the QP of `build` on MPI ranks, or None.
+    def subdomains(self, form: str, params: Mapping[str, Value]) -> int:
+        """Return the largest number of ranks that can build the case together.
 
-        All ranks must call the returned function, whose second argument is a reference
-        solver for distributed QPs. None means that a single process builds the QP. This
-        method does not build the QP and does not need MPI.
+        params : values of all keys
+        """
+        return 1
+
+    def on_ranks(
+        self, form: str, params: Mapping[str, Value]
+    ) -> Callable[[Comm, ReferenceOfOperator], CaseOnRanks] | None:
+        """Return a function that builds the case on several ranks, or None.
+
+        All ranks call the returned function together. None means that a single process
+        builds the QP. This method does not build the QP and does not need MPI.
 
         params : values of all keys
         """

@@ -35,12 +35,12 @@ from mortarbench.harness import (
     Verdict,
     checked,
 )
-from mortarbench.harness.distributed.mpi import ranks_asked
+from mortarbench.harness.distributed.mpi import ranks_asked, too_few_parts
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.npz import write_mappable
 from mortarbench.harness.files.store import POINT
-from mortarbench.harness.names import assemble, is_shared
+from mortarbench.harness.names import assemble
 from mortarbench.harness.processes.measurement import (
     measure_once,
     scratch_folder,
@@ -526,9 +526,22 @@ def solver_session(
             environment=environment,
         )
         source = Source.FILE
-        if ranks > 1 and is_shared(case.id):
+        if ranks > 1:
             ours = registries.hold_only_builtins()
             source = Source.RANKS if ours else Source.SHARES
+            parts = case.id.family.subdomains(case.id.form, case.id.params)
+            if parts < ranks:
+                record = record.replace(
+                    verdict=Verdict.DECLINED, message=too_few_parts(parts, ranks)
+                )
+                return Answer(
+                    case=case,
+                    record=record,
+                    solution=None,
+                    spec=spec,
+                    solver=solver,
+                    defaults=defaults,
+                )
         # Code of a family may print, and standard output is reserved for the answer.
         with one_thread(), redirect_stdout(stderr):
             record, solution = measure_once(

@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
+from mortarbench.harness.distributed.comm import Comm
+from mortarbench.harness.distributed.mpi import too_few_parts
 from mortarbench.harness.errors import InputError
+from mortarbench.harness.plugin import CaseOnRanks
 from mortarbench.harness.processes.case_worker import CaseWorker
 from mortarbench.harness.processes.case_worker import serve as serve_cases
-from mortarbench.harness.processes.ranks import launch, this_rank
+from mortarbench.harness.processes.ranks import launch
 from mortarbench.harness.processes.solver_file import read_solver
 from mortarbench.harness.processes.worker import serve
 from mortarbench.harness.registry import SolverSpec, resolve, stand_for_harness
@@ -34,25 +36,23 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     if "copy" in request:
         solvers = {spec.name: read_solver(Path(request["copy"]))}
     solver = resolve(spec, solvers)
-    ranks = this_rank() if request.get("ranks", 1) > 1 else None
 
-    def emit(case: Mapping[str, Any], ranks: Ranks) -> DistributedQP:
-        from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+    def build(case: Mapping[str, Any], comm: Comm) -> CaseOnRanks:
+        from mortarbench.solvers.reference.operators import reference_of_operator
 
         family = registries.families[case["family"]]
-        emission = family.emission(case["form"], case["params"])
-        if emission is None:
-            raise InputError(f"{family.name}: ranks cannot assemble this case")
-        return emission(ranks, reference_over_ranks)
+        on_ranks = family.on_ranks(case["form"], case["params"])
+        if on_ranks is None:
+            raise InputError(too_few_parts(1, comm.size))
+        return on_ranks(comm, reference_of_operator)
 
+    is_parallel = request.get("ranks", 1) > 1
     serve(
         solver,
         int(request_fd),
         int(reply_fd),
         registries.operators,
-        ranks,
-        emit,
-        copies=request.get("copies", False),
+        build if is_parallel else None,
     )
     return 0
 

@@ -47,3 +47,10 @@ def ranks_asked(count: object, where: str) -> int:
     if count > 1 and mpiexec() is None:
         raise InputError(f"{where} = {count} {MISSING}")
     return count
+
+
+def too_few_parts(parts: int, ranks: int) -> str:
+    """Return the message for a case that so many ranks cannot build together."""
+    if parts == 1:
+        return "the case is not in subdomains; expected one rank, or feti and form dual"
+    return f"{ranks} ranks for {parts} subdomains; expected at most one rank for each"

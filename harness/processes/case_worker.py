@@ -11,8 +11,6 @@ The process follows `harness.processes.protocol` and answers four kinds of reque
   {…}, "notes": […], "seconds": …}``, with the physical quantities of the point, the
   bounds on its error, and the time in which the quantities were computed. If ``fields``
   is a path and the case defines a deformed state, this state is written to ``fields``
-* ``{"shared": NAME}`` determines, without building the case, whether MPI ranks can emit
-  the QP of the case. Reply: ``{"event": "done", "shared": …}``
 * ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
   solver and writes the solution to the second file. This request is sent if the
   residuals do not decide a verdict. Reply: ``{"event": "done", "found": …}``, false if
@@ -48,7 +46,7 @@ from mortarbench.harness.files.store import (
     write_arrays,
     write_point,
 )
-from mortarbench.harness.names import CaseId, is_shared, unbuilt
+from mortarbench.harness.names import CaseId, unbuilt
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.processes.protocol import Events, answer_requests
@@ -91,10 +89,8 @@ class CaseWorker:
         """Answer one request; the reply reports failures of the family's code."""
         if "solve" in request:
             return self._solve(Path(request["solve"]), Path(request["point"]))
-        fields = request.get("build") or request.get("describe") or request["shared"]
+        fields = request.get("build") or request["describe"]
         name = CaseId(**{**fields, "family": self.families[fields["family"]]})
-        if "shared" in request:
-            return {"shared": is_shared(name)}
         try:
             if "first" in request:
                 first = request["first"]

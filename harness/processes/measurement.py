@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
-from math import inf, isinf, nan
+from math import inf, isinf
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 from typing import Any, NamedTuple
@@ -22,7 +22,6 @@ from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.forking import Serve
 from mortarbench.harness.processes.protocol import Source, source_of
-from mortarbench.harness.processes.ranks import qp_of_sizes
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import (
@@ -33,11 +32,10 @@ from mortarbench.harness.record import (
     journal_name,
 )
 from mortarbench.harness.solution import Solution, Status
-from mortarbench.harness.verify.kkt import Residuals
 from mortarbench.harness.verify.measure import REMEMBERED_SPEEDUP
 from mortarbench.harness.verify.verdicts import (
     certified,
-    has_point,
+    claimed,
     judged,
     noted,
     quantities_of,
@@ -55,7 +53,6 @@ REMEMBERED_NOTE = (
     f"takes more than {REMEMBERED_SPEEDUP:g} times as long, or returns the same point"
 )
 
-_NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
 
 
@@ -65,9 +62,7 @@ class JudgedMeasurement(NamedTuple):
     record: Record
     #: answer of the solver; None if the worker ended without an answer
     solution: Solution | None
-    #: False if the quantities and error bounds of the answer need not be computed any
-    #: more, because the ranks that solved the QP have evaluated their answer completely
-    #: or have returned no point
+    #: False if the ranks that solved the QP have computed quantities and error bounds
     needs_evaluation: bool = True
 
 
@@ -82,8 +77,7 @@ def measure_and_judge(
 ) -> JudgedMeasurement:
     """Measure once with a worker process, and complete `record` with costs and verdict.
 
-    whole : returns the entire QP. If ranks emit the QP and evaluate the answer, `whole`
-        is called only for values that the ranks cannot evaluate
+    whole : returns the QP; not called if ranks build the QP and judge the answer
     request : request to the worker, see `harness.processes.worker`; the tolerance and
         the memory limit are added. The worker writes the point to the file ``out``. If
         the worker ends in a repetition of a completed solve, the QP is solved and timed
@@ -98,7 +92,7 @@ def measure_and_judge(
         lost.
 
     """
-    request = {**request, "tol": record.asked_tol}
+    request = {**request, "tol": record.asked_tol, "judged_at": record.judged_at}
     if not isinf(memory_limit):
         request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
@@ -119,11 +113,11 @@ def measure_and_judge(
             threads=reply.threads,
             cpu=reply.cpu,
         )
-        if source_of(request) is Source.RANKS:
-            qp, record = sizes_from_ranks(reply.emitted, record)
-        else:
+        if source_of(request) is not Source.RANKS:
             qp = whole()
             record = record.replace(sizes=qp.sizes)
+        elif reply.emitted is not None:
+            record = record.replace(**reply.emitted)
         if reply.answer is None:
             return JudgedMeasurement(record.replace(verdict=reply.verdict), None)
         solution = replace(
@@ -142,28 +136,18 @@ def measure_and_judge(
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
     record, *more = _with_cost(reply, record)
     notes += more
-    sizes, by_ranks = record.sizes, source_of(request) is Source.RANKS
-    is_pointless = by_ranks and not has_point(solution)
-    evaluation = reply.answer["evaluated"] if by_ranks else None
-    notes += evaluation["notes"] if evaluation is not None else []
-    if evaluation is not None and evaluation["values"] is not None:
-        record = judged(record, qp, solution, values=evaluation["values"]).replace(
-            quantities=evaluation["quantities"] or {},
-            recover_seconds=evaluation["recover_seconds"],
-            **(evaluation["bounds"] or {}),
-        )
-    elif is_pointless:
-        record = judged(record, qp, solution, values=_NO_POINT)
+    by_ranks = source_of(request) is Source.RANKS
+    if by_ranks:
+        fields = dict(reply.answer["fields"])
+        fields["verdict"] = Verdict(fields["verdict"])
+        record = claimed(record, solution).replace(**fields)
+        notes += reply.answer["notes"]
     else:
-        record = judged(record, whole() if by_ranks else qp, solution)
+        record = judged(record, qp, solution)
     record = _check_memory(memory_limit, noted(record, reply.message, *notes)).replace(
-        sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
+        **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
     )
-    is_incomplete = evaluation is None or None in (
-        evaluation["quantities"],
-        evaluation["bounds"],
-    )
-    return JudgedMeasurement(record, solution, is_incomplete and not is_pointless)
+    return JudgedMeasurement(record, solution, needs_evaluation=not by_ranks)
 
 
 def _as_tuples(data: Any) -> Any:
@@ -191,25 +175,6 @@ def case_request(record: Record) -> dict[str, Any]:
     """Return the entry of a request that specifies the case whose QP the ranks emit."""
     case = {"family": record.family, "params": dict(record.params), "form": record.form}
     return {"case": case}
-
-
-def sizes_from_ranks(
-    emitted: Mapping[str, Any] | None, record: Record
-) -> tuple[QP, Record]:
-    """Return a placeholder QP of the emitted sizes, and the record with these sizes.
-
-    If the ranks emitted no QP, the placeholder has size zero and the record is
-    unchanged.
-
-    emitted : entries of the event "emitted", see `harness.processes.protocol`; None if
-        the event was not sent
-    """
-    if emitted is None or not emitted["sizes"]:
-        return qp_of_sizes(0, 0), record
-    sizes = emitted["sizes"]
-    return qp_of_sizes(sizes["variables"], sizes["equalities"]), record.replace(
-        sizes=sizes, qp=emitted["digest"], build_seconds=emitted["build_seconds"]
-    )
 
 
 def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
@@ -295,7 +260,7 @@ def measure_once(
     reference : reference solver, called if the residuals alone do not decide the
         verdict
     source : origin of the QP. For `Source.RANKS`, the ranks judge their answer
-        themselves, and the case is built only for values that the ranks cannot evaluate
+        themselves, and the case is not built
     time_limit : limit of the solve, in s
 
     Raises

@@ -7,13 +7,8 @@ execute orders that rank 0 sends. Each rank has its own CPU if there are enough 
 The memory limit applies to the sum over all ranks. If one rank ends, all other ranks
 are ended.
 
-A solver that supports ranks declares `on_ranks = True`. Its `prepare` is called on
-every rank with that rank's share of the QP (`harness.distributed.vectors.Share`), and
-the ranks return slices of one solution.
-
-As a baseline, the ranks can also solve copies: each rank solves the entire QP
-independently, at the same time as the other ranks. The slowest rank determines the
-measured time.
+The ranks build a case together. Rank 0 then runs the ordinary worker, whose products
+all ranks compute together (`harness.distributed.comm`).
 """
 
 from __future__ import annotations
@@ -26,46 +21,30 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass
 from select import EPOLLIN, PIPE_BUF, epoll
-from typing import Any, NamedTuple
+from typing import Any, Protocol
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import LinearOperator
 
-from mortarbench.harness.distributed.failures import (
+from mortarbench.harness.distributed.comm import (
     PEER_TIMEOUT,
     RECORD,
+    Comm,
+    Lead,
     RankFailedError,
-    abort,
     in_a_line,
-    run_collectively,
+    world,
 )
 from mortarbench.harness.distributed.mpi import MISSING, mpiexec
-from mortarbench.harness.distributed.network import network
-from mortarbench.harness.distributed.vectors import (
-    Distributable,
-    DistributedQP,
-    Emit,
-    Ranks,
-    Share,
-)
 from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.qpfile import load_qp
-from mortarbench.harness.operators import Maker, SerialisableOperator
-from mortarbench.harness.plugin import Solver
+from mortarbench.harness.plugin import Case, CaseOnRanks, Solver
 from mortarbench.harness.processes import reaper
 from mortarbench.harness.qp import QP, no_rows
-from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution
-from mortarbench.harness.verify.measure import memory_mib, reason_to_decline
-from mortarbench.harness.verify.verdicts import evaluated_by_ranks
-
-_ORDER = 7  #: MPI tag of the orders that rank 0 sends to the other ranks
-_IDLE_SECONDS = 2e-4  #: time between two probes for an order
+from mortarbench.harness.verify.measure import memory_mib
+from mortarbench.harness.verify.verdicts import evaluated, judgement
 
 
 def launch(ranks: int, command: Sequence[str]) -> int:
@@ -209,335 +188,147 @@ def _describe_exit(status: int) -> str:
     return f"exit code {os.waitstatus_to_exitcode(status)}"
 
 
-def this_rank() -> Ranks:
-    """Join the other ranks; bind this rank to its own CPU if there are enough CPUs.
+class Build(Protocol):
+    """Function that builds the case of a request; all ranks call it together."""
 
-    The speed of communication is measured at this point, before any solve is timed.
-    """
-    from mpi4py import MPI  # imported here, because only runs on ranks need it
-
-    cpus = fastest_first(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
-    if RECORD in os.environ:
-        os.set_inheritable(int(os.environ[RECORD]), False)
-    return Ranks(MPI.COMM_WORLD, network=network(MPI.COMM_WORLD))
+    def __call__(self, case: Mapping[str, Any], comm: Comm, /) -> CaseOnRanks:
+        """Build a case, given as a mapping with family, params and form."""
 
 
-def follow(
-    solver: Solver,
-    ranks: Ranks,
-    operators: Mapping[str, Maker],
-    emit: Emit,
-    limit: Callable[[float | None], None],
-) -> None:
-    """Execute the orders of rank 0 on this rank, until rank 0 sends None.
-
-    emit : assembles this rank's share of a case
-    limit : sets the memory limit of this process, in MiB; None removes the limit
-    """
-    run: Callable[[], Solution] | None = None
-    share: Share | None = None
-    emitted: DistributedQP | None = None
-    solution: Solution | None = None
-    while (order := _next_order(ranks)) is not None:
-        try:
-            if "case" in order:
-                run = share = emitted = None  # free memory before the next emission
-                # all ranks raise the same error, and rank 0 reports it
-                with suppress(InputError, RankFailedError):
-                    emitted, _ = _emit_on_ranks(emit, order["case"], ranks)
-                limit(order["memory_limit"])
-            elif "declines" in order and emitted is not None:
-                reason_to_decline(solver, emitted.share().qp)
-            elif "tol" in order and emitted is not None:
-                share = emitted.share()
-                run = solver.prepare(share.qp, order["tol"])
-                ranks.comm.Barrier()
-            elif "qp" in order:
-                qp, _ = load_qp(Path(order["qp"]), operators=operators)
-                limit(order["memory_limit"])
-                share = _share(qp, ranks, copies=order["copies"])
-                run = solver.prepare(share.qp, order["tol"])
-                ranks.comm.Barrier()
-            elif "evaluate" in order and emitted and solution:
-                run = share = None  # free the solver's memory before the evaluation
-                limit(None)
-                evaluated_by_ranks(emitted, solution, ranks)
-            elif run is not None and share is not None:
-                solution, _ = _solve_on_ranks(run, share, ranks)
-        except BaseException as e:
-            # If rank 0 also failed, it reports the failure and sends its next order. If
-            # no order arrives, rank 0 is waiting for this rank, so all ranks are
-            # aborted.
-            if _wait_for_order(ranks, PEER_TIMEOUT):
-                continue
-            abort(ranks, e)
-
-
-def _next_order(ranks: Ranks) -> dict[str, Any] | None:
-    _wait_for_order(ranks, np.inf)
-    order: dict[str, Any] | None = ranks.comm.recv(source=0, tag=_ORDER)
-    return order
-
-
-def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
-    """Wait for an order; return False if none arrives within `seconds`.
-
-    The loop sleeps between probes, because a blocking receive would keep the CPU busy.
-    """
-    deadline = time.monotonic() + seconds
-    while not ranks.comm.iprobe(source=0, tag=_ORDER):
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(_IDLE_SECONDS)
-    return True
-
-
-class RankCosts(NamedTuple):
-    """Costs of a solve on several ranks, each a pair (mean, largest) over the ranks.
-
-    The tables are empty for a solve in a single process and for copies.
-    """
-
-    seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by category of work
-    counts: Mapping[str, tuple[float, float]] = {}  #: counts by operation
-    network: Mapping[
-        str, tuple[float, float]
-    ] = {}  #: speed of communication, measured at the start
-
-    def fields(self) -> dict[str, Any]:
-        """Return the tables as fields of a record."""
-        return {f"rank_{name}": table for name, table in self._asdict().items()}
-
-
-class ParallelSolver:
-    """Solver on rank 0 that sends orders to the other ranks.
-
-    The ranks jointly solve one QP, and each rank has a share of the QP. If `copies` is
-    True, each rank instead solves a copy of the entire QP.
+class Host:
+    """State of one rank; rank 0 calls its methods on all ranks.
 
     Attributes
     ----------
-    spent : cost of the last solve on the ranks
+    served : objects of the case that the ranks have built
+    case : the case; None on all ranks but rank 0
+    failure : reason why the last build failed, else None
 
     """
 
     def __init__(
-        self, solver: Solver, ranks: Ranks, emit: Emit, *, copies: bool = False
+        self, comm: Comm, build: Build, limit: Callable[[float | None], None]
     ) -> None:
-        # messages of failures use `__wrapped__` to find the file of the wrapped solver
-        self._solver = self.__wrapped__ = solver
-        self._ranks = ranks
-        self._emit = emit
-        self._emitted: DistributedQP | None = None
-        self._emission_error: Exception | None = None
-        self._copies = copies
-        self._path = Path()
-        self._memory_limit: float | None = None
-        self.spent = RankCosts()
-        self._local_solution: Solution | None = None
+        """Join the other ranks.
 
-    def emit(
-        self, case: Mapping[str, Any], memory_limit: float | None
-    ) -> tuple[QP, dict[str, Any]]:
-        """Order all ranks to emit their shares of the next QP.
-
-        Returns
-        -------
-        a placeholder QP of the same sizes, and the entries of the event "emitted": the
-        `sizes` and the `digest` of the QP, and the time of the slowest rank, in s. If
-        the emission fails, the placeholder has size zero, the entries are empty, and
-        `declines` or `prepare` reports the failure.
-
+        limit : sets the memory limit of this process, in MiB; None removes the limit
         """
-        self._order({"case": dict(case), "memory_limit": memory_limit})
-        self._emitted = self._emission_error = self._local_solution = None
+        self.comm, self._build, self.limit = comm, build, limit
+        self.served: Any = None
+        self.case: Case | None = None
+        self.failure: Exception | None = None
+
+    def build(self, case: Mapping[str, Any]) -> str:
+        """Build a case; return the digest of its QP, or "" after a failure."""
+        self.served = self.case = self.failure = None  # free memory first
         try:
-            self._emitted, emission = _emit_on_ranks(self._emit, case, self._ranks)
-        except (InputError, RankFailedError) as e:
-            self._emission_error = e
-            return qp_of_sizes(0, 0), {"sizes": {}, "digest": "", "build_seconds": None}
-        sizes = self._emitted.variables, self._emitted.equality_rows
-        return qp_of_sizes(*sizes), emission
+            built = self.comm.together(lambda: self._build(case, self.comm))
+        except (InputError, RankFailedError) as e:  # all ranks raise the same error
+            self.failure = e
+            return ""
+        except Exception as e:
+            self.failure = RankFailedError(in_a_line(e))
+            return ""
+        self.served = built.served
+        if not self.comm.rank:
+            self._case = built.case
+        return built.digest
 
-    def evaluate(self) -> dict[str, Any] | None:
-        """Evaluate the last answer on all ranks; return None if its QP was not emitted.
+    def finish(self) -> None:
+        """Complete the case on rank 0, which calls methods of all ranks."""
+        self.case = self._case(Lead(self.comm, self.served, "served."))
 
-        Returns
-        -------
-        the result of `harness.verify.verdicts.evaluated_by_ranks`
+    def peaks(self) -> list[float]:
+        """Return the peak memory of each rank, in MiB."""
+        return self.comm.gather(memory_mib("VmHWM") or 0.0)
 
+
+class RanksAsOne:
+    """All ranks as seen by the worker on rank 0."""
+
+    def __init__(self, host: Host) -> None:
+        self.host, self._lead = host, Lead(host.comm, host)
+
+    def build(self, case: Mapping[str, Any]) -> dict[str, Any]:
+        """Build a case; return the entries of the event "emitted".
+
+        The entries are the `sizes` and the digest `qp` of the QP, and the time of the
+        slowest rank, in s. They are empty after a failure.
         """
-        if self._emitted is None or self._local_solution is None:
-            return None
-        self._order({"evaluate": True})
-        return evaluated_by_ranks(self._emitted, self._local_solution, self._ranks)
+        start, host = time.perf_counter(), self.host
+        digest = self._lead("build", dict(case))
+        if host.failure is not None:
+            return {}
+        try:
+            host.finish()
+        except InputError as e:
+            host.failure = e
+            return {}
+        assert host.case is not None
+        return {
+            "sizes": host.case.qp.sizes,
+            "qp": digest,
+            "build_seconds": time.perf_counter() - start,
+        }
 
-    def use_file(self, path: Path, memory_limit: float | None) -> None:
-        """Set the file from which all ranks read the next QP, instead of emitting it.
-
-        memory_limit : limit for each rank, in MiB; None for no limit
-        """
-        self._emitted = self._emission_error = self._local_solution = None
-        self._path, self._memory_limit = path, memory_limit
-
-    def end(self) -> None:
-        """Order the other ranks to end."""
-        self._order(None)
+    def solver(self, solver: Solver) -> Solver:
+        """Return the solver, or one that reports why the ranks have no QP."""
+        if self.host.failure is None:
+            return solver
+        return _Unbuilt(self.host.failure)
 
     @property
-    def accepts(self) -> tuple[type, ...]:
-        """Classes of convex sets that the solver accepts."""
-        return getattr(self._solver, "accepts", (Box,))
+    def qp(self) -> QP:
+        """The QP that the ranks have built, or an empty QP after a failure."""
+        if self.host.case is None:
+            return QP(P=np.zeros((0, 0)), q=np.zeros(0), A=no_rows(0), b=np.zeros(0))
+        return self.host.case.qp
+
+    def reported(self) -> dict[str, float]:
+        """Return the number and the peak memory of the ranks, for a solution."""
+        peaks = self._lead("peaks")
+        mean = sum(peaks) / len(peaks)
+        return {
+            "ranks": len(peaks),
+            "rank_peak_mib_largest": max(peaks),
+            "rank_peak_mib_mean": mean,
+        }
+
+    def limit(self, mib: float | None) -> None:
+        """Set the memory limit of each rank, in MiB; None removes the limit."""
+        self._lead("limit", mib)
+
+    def judge(self, s: Solution, tol: float) -> tuple[dict[str, Any], list[str]]:
+        """Judge an answer with new factors; return fields of a record, and notes."""
+        case = self.host.case
+        if case is None:
+            return judgement(self.qp, s, tol)[0], []
+        # factors that code of a solver may have reached are not used
+        self._lead("served.forget")
+        return evaluated(case, s, tol)
+
+    def end(self) -> None:
+        """End the service of the other ranks."""
+        self.host.comm.order(None)
+
+
+@dataclass(frozen=True)
+class _Unbuilt:
+    """Solver for a QP that the ranks could not build."""
+
+    failure: Exception
 
     def declines(self, qp: QP) -> str | None:
-        """Return the reason why the ranks cannot solve the QP, or None if they can."""
-        if self._copies:
-            return self._solver.declines(qp)
-        if not getattr(self._solver, "on_ranks", False):
-            return "runs in one process only; expected one rank"
-        # if the emission failed with another error, `prepare` raises it
-        if self._emission_error is not None:
-            is_input_error = isinstance(self._emission_error, InputError)
-            return str(self._emission_error) if is_input_error else None
-        if self._emitted is not None:
-            self._order({"declines": True})
-            return reason_to_decline(self._solver, self._emitted.share().qp)
-        product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
-        if not isinstance(product, Distributable):
-            return "P cannot be distributed over ranks; expected a case in subdomains"
-        if product.parts < self._ranks.size:
-            return (
-                f"{self._ranks.size} ranks for {product.parts} subdomains; expected at "
-                "most one rank per subdomain"
-            )
-        return self._solver.declines(qp)
+        return str(self.failure) if isinstance(self.failure, InputError) else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Prepare on all ranks; return when the slowest rank is ready."""
-        if self._emission_error is not None:
-            raise self._emission_error
-        if self._emitted is not None:
-            self._order({"tol": tol})
-            share = self._emitted.share()
-        else:
-            order = {
-                "qp": str(self._path),
-                "tol": tol,
-                "memory_limit": self._memory_limit,
-                "copies": self._copies,
-            }
-            self._order(order)
-            share = _share(qp, self._ranks, copies=self._copies)
-        run = self._solver.prepare(share.qp, tol)
-        self._ranks.comm.Barrier()
-
-        def solve() -> Solution:
-            self._order({})
-            self._local_solution, result = _solve_on_ranks(run, share, self._ranks)
-            assert result is not None  # on rank 0
-            solution, spent = result
-            self.spent = RankCosts() if self._copies else spent
-            return solution
-
-        return solve
-
-    def _order(self, order: dict[str, Any] | None) -> None:
-        for rank in range(1, self._ranks.size):
-            self._ranks.comm.send(order, dest=rank, tag=_ORDER)
+        raise self.failure
 
 
-def _emit_on_ranks(
-    emit: Emit, case: Mapping[str, Any], ranks: Ranks
-) -> tuple[DistributedQP, dict[str, Any]]:
-    """Emit a case on all ranks; return the local part and the entries of the event.
-
-    Any error is raised on all ranks.
-
-    Raises
-    ------
-    InputError
-        If the family raises an InputError on every rank.
-    RankFailedError
-        If the emission fails in any other way on at least one rank.
-
-    """
-    start = time.perf_counter()
-    try:
-        emitted = run_collectively(ranks, lambda: emit(case, ranks))
-        # The call above is collective: it returns when the slowest rank is done.
-        seconds = time.perf_counter() - start
-        digest = run_collectively(ranks, emitted.digest)
-        entries = {"sizes": emitted.sizes, "digest": digest, "build_seconds": seconds}
-        return emitted, entries
-    except InputError:
-        raise
-    except Exception as e:
-        why = str(e) if isinstance(e, RankFailedError) else in_a_line(e)
-        raise RankFailedError(f"emission: {why}") from e
-
-
-def qp_of_sizes(variables: int, equality_rows: int) -> QP:
-    """Return a placeholder of given sizes for a QP that no single process stores.
-
-    Vectors with a component for each variable are broadcast scalars, which occupy
-    almost no memory.
-    """
-    n, m = variables, equality_rows
-    zeros = np.broadcast_to(0.0, n)
-    return QP(
-        P=LinearOperator((n, n), matvec=lambda x: 0 * x, dtype=float),
-        q=zeros,
-        lb=zeros,
-        ub=zeros,
-        G=no_rows(n),
-        h=np.zeros(0),
-        A=csr_array((m, n)),
-        b=np.zeros(m),
-    )
-
-
-def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
-    if copies:
-        return Share(qp, lambda solution: solution if ranks.rank == 0 else None)
-    product = qp.P.build()
-    assert isinstance(product, Distributable)
-    return product.share(qp, ranks)
-
-
-def _solve_on_ranks(
-    run: Callable[[], Solution], share: Share, ranks: Ranks
-) -> tuple[Solution, tuple[Solution, RankCosts] | None]:
-    """Solve the local share of a QP.
-
-    Returns
-    -------
-    the local slice of the solution, and on rank 0 also the entire solution with the
-    costs over all ranks; None on other ranks
-
-    """
-    ranks.clear()
-    s = run()
-    # copy before `share.whole`, whose communication does not belong to the solve
-    seconds, counts = dict(ranks.seconds), dict(ranks.counts)
-    solution = share.whole(s)
-    peak = memory_mib("VmHWM") or 0.0
-    costs = ranks.comm.gather((seconds, counts, dict(ranks.network), peak))
-    if solution is None or costs is None:
-        return s, None
-    *tables, peaks = zip(*costs, strict=True)
-    reported = {
-        **solution.reported,
-        "ranks": ranks.size,
-        "rank_peak_mib_largest": max(peaks),
-        "rank_peak_mib_mean": sum(peaks) / ranks.size,
-    }
-    spent = RankCosts(*map(_mean_and_largest, tables))
-    return s, (replace(solution, reported=reported), spent)
-
-
-def _mean_and_largest(
-    each: Sequence[Mapping[str, float]],
-) -> dict[str, tuple[float, float]]:
-    values = {name: [float(one[name]) for one in each] for name in each[0]}
-    return {name: (sum(v) / len(v), max(v)) for name, v in values.items()}
+def this_rank(build: Build, limit: Callable[[float | None], None]) -> Host:
+    """Join the other ranks; bind this rank to its own CPU if there are enough CPUs."""
+    comm, cpus = world(), fastest_first(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {cpus[comm.rank % len(cpus)]})
+    if RECORD in os.environ:
+        os.set_inheritable(int(os.environ[RECORD]), False)
+    return Host(comm, build, limit)

@@ -14,12 +14,12 @@ answers three kinds of requests:
   - ``step``: index 0, 1, … of the QP in a sequence, and
   - ``tightens``: true if each step of the sequence has its own tolerance
 
-* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: emit the QP of a case on the
-  MPI ranks (`harness.plugin.Family.emission`), measure, and write the point to ``out``.
-  If the request has the entry ``first``, the ranks emit the case in that entry
-  beforehand. If ``source`` is "ranks", the ranks also evaluate the answer. The event
-  ``emitted`` contains the ``sizes``, the ``digest`` and the ``build_seconds`` of the
-  QP; the event ``measured`` is sent when the point has been written
+* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: build a case on the MPI ranks
+  (`harness.plugin.Family.on_ranks`), measure, and write the point to ``out``. If the
+  request has the entry ``first``, the ranks build the case in that entry beforehand. If
+  ``source`` is "ranks", the ranks also judge the answer at the tolerance ``judged_at``.
+  The event ``emitted`` contains the fields ``sizes``, ``qp`` and ``build_seconds`` of
+  the record; the event ``measured`` is sent when the point has been written
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
 Every measurement loads the QP again, so that modifications by a solver do not affect
@@ -35,7 +35,7 @@ import random
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -45,7 +45,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from mortarbench.harness.distributed.vectors import Emit, Ranks
+from mortarbench.harness.distributed.comm import serve as serve_rank
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
@@ -57,7 +57,7 @@ from mortarbench.harness.processes.protocol import (
     answer_requests,
     source_of,
 )
-from mortarbench.harness.processes.ranks import ParallelSolver, RankCosts, follow
+from mortarbench.harness.processes.ranks import Build, RanksAsOne, this_rank
 from mortarbench.harness.qp import QP, Vector, no_rows
 from mortarbench.harness.record import finite, journal_name
 from mortarbench.harness.solution import Solution, Status
@@ -80,32 +80,27 @@ def serve(
     request_fd: int,
     reply_fd: int,
     operators: Mapping[str, Maker] = NO_MAKERS,
-    ranks: Ranks | None = None,
-    emit: Emit | None = None,
-    *,
-    copies: bool = False,
+    build: Build | None = None,
 ) -> None:
     """Answer requests until the pipe of requests is closed.
 
     operators : makers of operators P by name, see `harness.operators`
-    ranks : communicator of the ranks that solve together; None in a single process
-    emit : assembles the local share of a case on each rank
-    copies : True if each rank solves the entire QP independently, at the same time as
-        the other ranks
+    build : builds a case on all MPI ranks; None in a single process
     """
     bench = _SolverHost(solver, operators)
-    if ranks is None or emit is None:
+    if build is None:
         answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
         return
-    if ranks.rank:
+    host = this_rank(build, _limit_memory)
+    if host.comm.rank:
         os.close(request_fd)
         os.close(reply_fd)
         bench.warm_up()
-        follow(solver, ranks, operators, emit, _limit_memory)
+        serve_rank(host.comm, host)
         return
-    bench.parallel = ParallelSolver(solver, ranks, emit, copies=copies)
+    bench.ranks = RanksAsOne(host)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
-    bench.parallel.end()
+    bench.ranks.end()
 
 
 class _SolverHost:
@@ -120,8 +115,8 @@ class _SolverHost:
         # content
         self._verified_files: dict[str, tuple[int, ...]] = {}
         self._ballast = np.empty(0)
-        #: on several ranks, replaces the solver in measurements
-        self.parallel: ParallelSolver | None = None
+        #: the MPI ranks that solve together; None in a single process
+        self.ranks: RanksAsOne | None = None
 
     def warm_up(self) -> dict[str, Any]:
         """Solve a QP with bounds, and one with bounds and rows; ignore the results.
@@ -164,40 +159,39 @@ class _SolverHost:
             # otherwise the allocator would reuse freed blocks at their old addresses
             ctypes.CDLL(None).malloc_trim(0)
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
-        source = source_of(request)
-        if source.is_shared:
-            assert self.parallel is not None
-            limit = request.get("memory_limit")
+        limit, ranks, solver = request.get("memory_limit"), self.ranks, self._solver
+        if ranks is not None:
             if "first" in request:
-                self.parallel.emit(request["first"], limit)
-            qp, emission = self.parallel.emit(request["case"], limit)
-            events.reached("emitted", emission)
+                ranks.build(request["first"])
+            events.reached("emitted", ranks.build(request["case"]))
+            qp, solver = ranks.qp, ranks.solver(solver)
         else:
             qp = self._load(request)
+        set_limit = _limit_memory if ranks is None else ranks.limit
         canary = canary_seconds()
-        _limit_memory(request.get("memory_limit"))
+        set_limit(limit)
         timed = measure(
-            self.parallel or self._solver,
+            solver,
             qp,
             request["tol"],
             prepare=self._step(request),
             once=request.get("once", False),
-            perturbs=self.parallel is None,  # ranks assemble their shares of the QP
             starts=events.start,
             solved=events.solved,
             ends=events.timed,
         )
-        _limit_memory(None)
-        s = timed.solution
+        set_limit(None)
+        s, judged = timed.solution, dict[str, Any]()
+        if ranks is not None:
+            s = replace(s, reported={**s.reported, **ranks.reported()})
         write_point(Path(request["out"]), s)
-        spent = RankCosts() if self.parallel is None else self.parallel.spent
-        evaluated = dict[str, Any]()
-        if source.is_shared and self.parallel is not None:
+        if ranks is not None:
             events.reached("measured", {})
-            is_judge = source is Source.RANKS
-            evaluated = {"evaluated": self.parallel.evaluate() if is_judge else None}
+            if source_of(request) is Source.RANKS:
+                fields, notes = ranks.judge(s, request["judged_at"])
+                judged = {"fields": fields, "notes": [*filter(None, notes)]}
         return {
-            **evaluated,
+            **judged,
             "claimed": s.status,
             "message": s.message,
             "iterations": s.iterations,
@@ -206,7 +200,7 @@ class _SolverHost:
             "worked_seconds": timed.worked_seconds,
             "solves": timed.solves,
             # fields that the parent copies to the record unchanged
-            "record": {"canary_seconds": canary, **spent.fields()},
+            "record": {"canary_seconds": canary},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
@@ -222,10 +216,7 @@ class _SolverHost:
                 self._verified_files[digest] = version
         # A file without a digest may have any origin, so its operators are not built.
         is_ours = digest is not None
-        qp, _ = load_qp(path, operators=self._operators if is_ours else None)
-        if self.parallel is not None:
-            self.parallel.use_file(path, request.get("memory_limit"))
-        return qp
+        return load_qp(path, operators=self._operators if is_ours else None)[0]
 
     def _step(self, request: dict[str, Any]) -> Prepare | None:
         """Return the `prepare` function of a step; step 0 begins a new sequence.

@@ -21,7 +21,6 @@ from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
-from mortarbench.harness.registry import COPIES
 from mortarbench.harness.results.work_unit import (
     BuildFailure,
     Commands,
@@ -61,7 +60,6 @@ class Executor:
     # limit exceeded while building the cases of the current block; None otherwise
     _limit_hit: _BuildLimitError | None = None
     # True if ranks can emit the QP of a case, by name of the case
-    _shared: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._case_worker = WorkerProcess(
@@ -137,7 +135,7 @@ class Executor:
         """Measure one solver once on each case.
 
         If ranks emit a QP and execute no plug-in code, the ranks also judge the
-        answer. The case is then built only for values that the ranks cannot evaluate.
+        answer. The case is then not built.
 
         Raises
         ------
@@ -211,16 +209,8 @@ class Executor:
         return request, record.replace(**meta, step_tol=_step_tol(record, entry))
 
     def _source(self, record: Record) -> Source:
-        """Return the origin of a record's QP; query the case worker once per case."""
-        if record.ranks == 1 or record.role == COPIES or record.mode != "cold":
-            return Source.FILE
-        if record.case not in self._shared:
-            request = {"shared": _case(record)}
-            reply = self._case_worker.ask(request, time_limit=inf, memory_limit=inf)
-            if reply.answer is None:
-                raise FaultError(reply.message)
-            self._shared[record.case] = reply.answer["shared"]
-        if not self._shared[record.case]:
+        """Return the origin of a record's QP."""
+        if record.ranks == 1:
             return Source.FILE
         return Source.RANKS if self.commands.own_code_only else Source.SHARES
 

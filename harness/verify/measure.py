@@ -23,7 +23,7 @@ from scipy.sparse import issparse
 
 from mortarbench.harness.errors import shortened, shown
 from mortarbench.harness.limits import too_large
-from mortarbench.harness.operators import SerialisableOperator, assembled
+from mortarbench.harness.operators import assembled
 from mortarbench.harness.plugin import About, Solver
 from mortarbench.harness.qp import NEEDS_MATRICES, QP, Vector
 from mortarbench.harness.record import Measurement
@@ -81,7 +81,6 @@ def measure(
     *,
     prepare: Prepare | None = None,
     once: bool = False,
-    perturbs: bool = True,
     starts: Callable[[], None] = _nothing,
     solved: Callable[[], None] = _nothing,
     ends: Callable[[], None] = _nothing,
@@ -110,7 +109,6 @@ def measure(
     prepare : function that replaces ``solver.prepare`` in a step of a sequence, see
         `harness.plugin.Chained`; the step is solved once
     once : True for a single solve, which is timed
-    perturbs : False to omit the solves of perturbed QPs
     starts : called just before the first solve
     solved : called after the first solve
     ends : called after the last solve
@@ -125,7 +123,7 @@ def measure(
                 solved()
             repeats, remembered, untimed = [seconds], None, 0
             if not (once or prepare or sum(seconds) > MAX_UNTIMED_SECONDS):
-                rest = _Perturbed(run, qp, answer) if perturbs else None
+                rest = _Perturbed(run, qp, answer)
                 answer, repeats = _repeated(run, qp, rest)
                 remembered = None if rest is None else rest.remembered(repeats)
                 untimed = run.solves - len(repeats)
@@ -225,7 +223,7 @@ class _Run:
             if os.getpid() != process:
                 os._exit(0)  # a child that the solver forked, and that returned
             self.worked_seconds += perf_counter() - entered
-        if isinstance(qp.P, SerialisableOperator):
+        if hasattr(qp.P, "forget"):
             qp.P.forget()
         return answer, (ready - start, end - resumed), (prepare_peak, solve_peak)
 
@@ -237,7 +235,7 @@ class _Run:
             reason = reason_to_decline(self._solver, qp)
         if reason is not None:
             raise DeclinedError(one_line(reason))
-        if isinstance(qp.P, SerialisableOperator):
+        if hasattr(qp.P, "build"):
             qp.P.build()
         return self._prepare(qp)
 

@@ -5,30 +5,18 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from datetime import UTC, datetime
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array, hstack
-from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.distributed.failures import run_collectively
-from mortarbench.harness.distributed.vectors import (
-    DistributedQP,
-    Ranks,
-    distributed,
-)
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Case
-from mortarbench.harness.qp import QP, Vector, no_rows
+from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.registry import COPIES, SolverSpec
-from mortarbench.harness.sets.box import Box
-from mortarbench.harness.sets.convex import ConvexSet
-from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
 from mortarbench.harness.verify.certificate import (
     Certificate,
@@ -39,13 +27,11 @@ from mortarbench.harness.verify.certificate import (
 )
 from mortarbench.harness.verify.infeasibility import certificate_of
 from mortarbench.harness.verify.kkt import (
-    Residuals,
     diagnosis,
     kkt_residuals,
     scaling_of,
     verdict,
 )
-from mortarbench.harness.verify.over_ranks import certify_over_ranks
 
 #: Version of the data from which a run_id is computed, independent of the schema of
 #: records.
@@ -103,51 +89,57 @@ def new_record(
     )
 
 
-def judged(
-    record: Record,
-    qp: QP,
-    s: Solution,
-    values: Mapping[str, Any] | None = None,
-) -> Record:
-    """Complete a record with the claim of an answer `s`, its residuals and the verdict.
+def judged(record: Record, qp: QP, s: Solution) -> Record:
+    """Complete a record with the claim of an answer, its residuals and the verdict."""
+    record = claimed(record.replace(sizes=qp.sizes), s)
+    fields, note = judgement(qp, s, record.judged_at)
+    return noted(record.replace(**fields), note)
 
-    values : residuals and objective that ranks have evaluated; None to evaluate them in
-        this function
-    """
-    record = record.replace(
-        sizes=qp.sizes,
+
+def claimed(record: Record, s: Solution) -> Record:
+    """Complete a record with the claim of an answer."""
+    return record.replace(
         claimed=s.status.value,
         message=s.message,
         iterations=s.iterations,
         counts=s.counts,
         reported=s.reported,
     )
+
+
+def judgement(qp: QP, s: Solution, tol: float) -> tuple[dict[str, Any], str]:
+    """Return the verdict on an answer with its residuals, as fields of a record.
+
+    The second result is a note on the reason if the answer is not verified, else "".
+    """
     if s.status is Status.DECLINED:
-        return record.replace(verdict=Verdict.DECLINED)
-    if values is not None:
-        residuals = Residuals(*(values[name] for name in Residuals._fields))
-        objective = values["objective"]
-    else:
-        with np.errstate(all="ignore"):  # a point may contain NaN, inf, or 1e300
-            residuals = kkt_residuals(qp, s)
-            objective = qp.objective(s.x)
-    tol = record.judged_at
-    outcome = verdict(s.status, residuals, tol)
+        return {"verdict": Verdict.DECLINED}, ""
+    with np.errstate(all="ignore"):  # a point may contain NaN, inf, or 1e300
+        residuals, objective = kkt_residuals(qp, s), qp.objective(s.x)
+    outcome, note = verdict(s.status, residuals, tol), ""
     if s.status in NO_SOLUTION:
-        if values is not None:
-            holds, reason = False, f"claims of {s.status} QPs are not examined on ranks"
-        else:
-            holds, reason = certificate_of(qp, s, tol)
+        holds, note = certificate_of(qp, s, tol)
         outcome = Verdict(f"verified_{s.status}") if holds else outcome
-        record = noted(record, reason)
-    elif s.status is Status.SOLVED and not outcome.is_verified and values is None:
-        record = noted(record, diagnosis(qp, s, tol))
-    return record.replace(
-        verdict=outcome,
-        objective=objective,
-        approximate_scale=values is None and scaling_of(qp).is_approximate,
+    elif s.status is Status.SOLVED and not outcome.is_verified:
+        note = diagnosis(qp, s, tol)
+    return {
+        "verdict": outcome,
+        "objective": objective,
+        "approximate_scale": scaling_of(qp).is_approximate,
         **residuals._asdict(),
-    )
+    }, note
+
+
+def evaluated(case: Case, s: Solution, tol: float) -> tuple[dict[str, Any], list[str]]:
+    """Judge an answer completely: return fields of a record, and notes."""
+    fields, *notes = judgement(case.qp, s, tol)
+    if s.status is Status.DECLINED:
+        return fields, notes
+    start = perf_counter()
+    quantities, note = quantities_of(case, s)
+    fields |= {"quantities": quantities, "recover_seconds": perf_counter() - start}
+    bounds, objection = certified(case, s)
+    return fields | bounds, [*notes, note, objection]
 
 
 def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
@@ -196,106 +188,6 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     if not was_loaded and LATE_IMPORT in sys.modules:  # exclude the time of the import
         result = _certified(certificate)
     return result
-
-
-def evaluated_by_ranks(
-    emitted: DistributedQP, s: Solution, ranks: Ranks
-) -> dict[str, Any]:
-    """Evaluate an answer on all ranks, from the local slices of the solution.
-
-    The evaluation uses a new copy of the local part of the QP, which the solver cannot
-    have modified. All ranks must call this function, and all ranks report the failure
-    of any rank (`harness.distributed.failures`).
-
-    Returns
-    -------
-    a dict with `values`: objective and residuals, or None if they are not finite or
-    require the whole QP; `bounds`: fields of `certified`, or None if they require the
-    whole QP; `quantities`: physical quantities, or None if they require the whole QP;
-    `recover_seconds`: time to evaluate the quantities; `notes`: reasons of failures.
-    After a failure, the values concerned are None or empty. If `values` is None, all
-    values are None
-
-    """
-    found: dict[str, Any] = {
-        "values": None,
-        "bounds": None,
-        "quantities": None,
-        "recover_seconds": None,
-        "notes": list[str](),
-    }
-    try:
-        found["values"] = run_collectively(
-            ranks, lambda: _values_by_ranks(emitted, s, ranks)
-        )
-        if found["values"] is None:
-            return found
-        answered = run_collectively(ranks, lambda: emitted.answer(s))
-    except Exception as e:
-        return {**found, "notes": [note_of("evaluation by ranks", e)]}
-    if (certifiable := answered.certifiable) is not None:
-        found["bounds"], note = _certified(
-            lambda: run_collectively(ranks, lambda: certify_over_ranks(*certifiable))
-        )
-        found["notes"] += filter(None, [note])
-    if (results := answered.quantities) is not None:
-        start = perf_counter()
-        try:
-            with np.errstate(all="ignore"):
-                found["quantities"] = plain(run_collectively(ranks, results))
-            found["recover_seconds"] = perf_counter() - start
-        except Exception as e:
-            found["quantities"] = {}
-            found["notes"].append(note_of("quantities", e))
-    return found
-
-
-def _values_by_ranks(
-    emitted: DistributedQP, s: Solution, ranks: Ranks
-) -> dict[str, float] | None:
-    """Evaluate objective and residuals; return None if they are not finite."""
-    share = emitted.share().qp
-    qp, s = gathered(share, s, ranks)
-    with np.errstate(all="ignore"):
-        residuals, objective = kkt_residuals(qp, s), qp.objective(s.x)
-    if not np.isfinite([*residuals, objective]).all():
-        return None
-    return {"objective": float(objective), **residuals._asdict()}
-
-
-def gathered(share: QP, s: Solution, ranks: Ranks) -> tuple[QP, Solution]:
-    """Return the whole QP and solution on every rank, given the slices of all ranks.
-
-    Variables are in the order of the ranks, of which residuals are independent. P
-    remains distributed: a product is collective.
-    """
-    counts = ranks.comm.allgather(share.q.size)
-    start, n = sum(counts[: ranks.rank]), sum(counts)
-    here = slice(start, start + counts[ranks.rank])
-
-    def whole(part: Any) -> Vector:
-        return np.concatenate(ranks.comm.allgather(np.asarray(part)))
-
-    def product(x: Vector) -> Vector:
-        return whole(share.P @ distributed(x.ravel()[here], ranks))
-
-    P = LinearOperator((n, n), matvec=product, dtype=float)
-    diagonal = share.diagonal()
-    if diagonal is not None:
-        total = whole(diagonal)
-        P.diagonal = lambda: total
-    sets: list[ConvexSet] = [Box(whole(share.lb), whole(share.ub))]
-    discs = [one for one in share.sets[1:] if isinstance(one, Discs)]
-    parts = ranks.comm.allgather(
-        [(one.index + start, np.asarray(one.radius)) for one in discs]
-    )
-    for same in zip(*parts, strict=True):
-        index, radius = (np.concatenate(arrays) for arrays in zip(*same, strict=True))
-        if radius.size:
-            sets.append(Discs(index, radius))
-    A = csr_array(hstack(ranks.comm.allgather(share.A.part)))
-    qp = QP(P=P, q=whole(share.q), A=A, b=share.b, G=no_rows(n), h=share.h, sets=sets)
-    return qp, replace(s, x=whole(s.x), z_box=whole(s.z_box))
 
 
 #: module that loads slowly, needed by `certify` for some bodies

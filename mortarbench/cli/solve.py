@@ -20,7 +20,7 @@ from mortarbench.arguments import (
 from mortarbench.harness import checked
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, say
-from mortarbench.harness.names import assemble, is_shared, parse
+from mortarbench.harness.names import assemble, parse
 from mortarbench.harness.registry import check_name
 from mortarbench.harness.suite.solver_options import options_for
 from mortarbench.registries import Registries, defer_parts_of_numpy
@@ -73,7 +73,7 @@ def run(registries: Registries, options: Namespace) -> int:
     with session as solve, waiting() as progress:
         progress(f"building {parsed.name}")
         case = Case(id=parsed, registries=registries)
-        if pictures or options.mpi == 1 or not (is_builtin and is_shared(parsed)):
+        if pictures or options.mpi == 1 or not is_builtin:
             # built after the fork, so that the worker does not inherit the memory
             _build(case, pictures)
         limit = f"time limit {options.time_limit:g} s"

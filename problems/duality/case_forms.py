@@ -22,6 +22,7 @@ from mortarbench.harness import (
     Solution,
     Vector,
 )
+from mortarbench.harness.distributed.comm import SERIAL, Lead
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.balance import least_motion
 from mortarbench.problems.contact.bodies import Bodies
@@ -43,12 +44,9 @@ from mortarbench.problems.duality.problem import (
 )
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import Mesh, Nodes
-from mortarbench.problems.feti.local_bodies import certifier
-from mortarbench.problems.feti.subdomains import (
-    Contact,
-    DecomposedProblem,
-    on_one_process,
-)
+from mortarbench.problems.feti.mechanics import torn_mechanics
+from mortarbench.problems.feti.served import Served
+from mortarbench.problems.feti.subdomains import Contact, TornBodies
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -72,9 +70,8 @@ def case_of(
         contact = Contact(rows, c, friction.bound, friction.tangents)
         stage = problem.stages[path.last_of(choice.step)]
         layout = cached_layout(elastic, choice.size)
-        decomposed = decompose(
-            elastic, layout, choice.glue, stage, contact, choice.cluster
-        )
+        parts = decompose(elastic, layout, choice.glue, stage, contact)
+        decomposed = Served(TornBodies(parts))
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
@@ -127,10 +124,6 @@ class MonolithicSolution:
         """Return the nondimensional displacement at components (k,)."""
         return self.sides.solution.x[component]
 
-    def largest(self, value: float) -> float:
-        """Return `value` unchanged, because there is only one process."""
-        return value
-
     def meshes(self) -> Iterator[DisplacedMesh]:
         """Yield the displaced mesh of each body."""
         bodies, u = self.bodies, self.sides.solution.x * self.bodies.length
@@ -151,7 +144,7 @@ def contact_case(
     supported: Factorise,
     quantities: Callable[[Solution], Mapping[str, Any]],
     friction: Friction = NO_FRICTION,
-    parts: DecomposedProblem | None = None,
+    parts: Served | None = None,
 ) -> Case:
     """Return the case, in one of FORMS, of a contact problem with a given primal QP.
 
@@ -170,21 +163,20 @@ def contact_case(
         problem; z of this solution lists the multipliers of the contact rows, then
         those of the friction rows
     friction : friction law with a prescribed bound; the objective includes its work
-    parts : decomposed problem; if present, `form` is ignored and the case is its dual
+    parts : decomposed bodies; if present, `form` is ignored and the case is their dual
 
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, certify_by_subdomains, subdomains = None, None, None
+    seconds, by_subdomains, subdomains = None, None, None
     if parts is not None:
         start = perf_counter()
-        local = on_one_process(parts)
-        decomposed, certify_by_subdomains = local.decomposed, certifier(local, primal.P)
-        transformed = feti_dual(decomposed, primal, friction)
+        transformed = feti_dual(parts, primal, friction)
         seconds = perf_counter() - start
-        subdomains = parts.layout.label
-        matrices = feti_matrices(decomposed, transformed.qp)
-        decomposition = decomposition_quantities(decomposed, transformed.qp)
+        subdomains = parts.torn.problem.layout.label
+        by_subdomains = torn_mechanics(parts, Lead(SERIAL, parts), primal.P)
+        matrices = feti_matrices(parts, transformed.qp)
+        decomposition = decomposition_quantities(parts, transformed.qp)
     elif form == "primal":
         transformed = primal_form(primal, friction)
     else:
@@ -240,7 +232,7 @@ def contact_case(
             ),
             friction=friction,
             # subdomains are certified for supports with u = 0
-            certify_by_subdomains=None if has_lift else certify_by_subdomains,
+            subdomains=None if has_lift else by_subdomains,
         ),
         unsettled=friction.unsettled,
     )

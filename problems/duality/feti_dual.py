@@ -6,105 +6,178 @@
     F = BK⁺Bᵀ,   d = BK⁺f − c,   K = diag(K_s),   R = diag(R_s)
 
 This is the dual of `problems.duality.dualisation`, assembled from subdomains (Total
-FETI; Dostál, Horák and Kučera 2006). F is an operator: a sum over subdomains, which is
-stored as plain arrays (`problems.feti.operators`). RᵀBᵀ is sparse. If averages join
-subdomains into clusters, K̃⁺ and RN replace K⁺ and R
-(`problems.feti.subdomain_classes.Clusters`).
+FETI; Dostál, Horák and Kučera 2006). F is an operator: a sum over subdomains
+(`problems.feti.operators`). RᵀBᵀ is sparse.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.distributed.comm import Lead
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.problems.duality.dualisation import Transformed, multiplier_sets
-from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import block_bytes, touched_components
-from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
+from mortarbench.problems.feti.served import Served, operator_of, parts_of
+from mortarbench.problems.feti.subdomains import TornBodies
+from mortarbench.problems.feti.substructures import LocalProblems, LocalProblemsOnRanks
+
+
+@dataclass(frozen=True, eq=False)
+class TornDual:
+    """The dual of torn bodies on rank 0, which calls methods of all ranks."""
+
+    served: Served  #: objects on rank 0
+    lead: Lead
+
+    @property
+    def torn(self) -> TornBodies:
+        """The torn bodies."""
+        return self.served.torn
+
+    @cached_property
+    def free(self) -> Vector:
+        """K⁺f (N,), the displacement without multipliers."""
+        return np.asarray(self.lead("domains.inverse", self.torn.f))
+
+    @cached_property
+    def R(self) -> csr_array:
+        """Rigid motions (N, r) of all subdomains."""
+        kernel: csr_array = self.lead("domains.kernel")
+        return kernel
+
+    @cached_property
+    def parts(self) -> LocalProblems | LocalProblemsOnRanks:
+        """The local problems for certificates."""
+        return parts_of(self.served, self.lead)
+
+    @property
+    def sets(self) -> tuple[ConvexSet, ...]:
+        """The sets of the multipliers: λ_n ≥ 0, ‖λ_t‖ ≤ g/scale."""
+        contact = self.torn.problem.contact
+        normals = contact.c.size - contact.bound.size
+        bound = contact.bound / self.torn.problem.contact_scale[normals:]
+        E = self.torn.rows.equalities
+        return multiplier_sets(E, normals, bound, contact.tangents)
+
+    @cached_property
+    def qp(self) -> QP:
+        """The dual QP."""
+        B, c, _ = self.torn.rows
+        return QP(
+            P=operator_of(self.served, self.lead),
+            q=c - B @ self.free,
+            A=csr_array((B @ self.R).T),
+            b=self.R.T @ self.torn.f,
+            G=no_rows(c.size),
+            h=np.zeros(0),
+            sets=self.sets,
+        )
+
+    def displacement(self, s: Solution) -> Vector:
+        """Return u = (TᵀT)⁻¹Tᵀv (n,), the average over the copies of each node.
+
+        The torn displacement is v = K⁺(f − Bᵀλ) − Rα, where α are the multipliers of
+        RᵀBᵀλ = Rᵀf. At the solution, all copies are equal. Eliminated components have
+        no copy, and u = 0 there.
+        """
+        B, T, f = self.torn.rows.B, self.torn.spread, self.torn.f
+        v = self.lead("domains.inverse", f - B.T @ s.x) - self.R @ s.y
+        squares = csr_array((T.data**2, T.indices, T.indptr), T.shape)
+        copies = squares.T @ np.ones(v.size)
+        return np.asarray((T.T @ v) / np.maximum(copies, 1))
+
+    def multipliers(self, s: Solution) -> Vector:
+        """Return the multipliers (m_I,) of the unscaled contact and friction rows."""
+        rows, scale = self.torn.rows, self.torn.problem.contact_scale
+        return np.asarray(scale * s.x[rows.equalities :])
 
 
 def feti_dual(
-    bodies: DecomposedBodies, primal: QP, friction: Friction = NO_FRICTION
+    served: Served,
+    primal: QP,
+    friction: Friction = NO_FRICTION,
+    lead: Lead | None = None,
 ) -> Transformed:
     """Return the dual of a contact problem on decomposed bodies.
 
-    The inverse map computes  v = K⁺(f − Bᵀλ) − Rα,  where α are the multipliers of
-    RᵀBᵀλ = Rᵀf, and averages over the copies of each node, u = (TᵀT)⁻¹Tᵀv. At the
-    solution, all copies are equal. The multipliers of the supports (reactions) follow
-    from stationarity.
+    The multipliers of the supports (reactions) follow from stationarity.
 
     Parameters
     ----------
-    bodies : decomposed bodies, whose last constraint rows are the contact rows of
-        `primal` followed by the friction rows
+    served : decomposed bodies, whose contact rows are the contact rows of `primal`
+        followed by the friction rows
     primal : QP of the undivided bodies
     friction : friction law with a prescribed bound
+    lead : calls methods on all ranks; None on one process
 
     """
-    units, R, T = bodies.units, bodies.units.kernel, bodies.spread
-    B, f, m_E, scale = bodies.B, bodies.f, bodies.equalities, bodies.scale
-    free = units.inverse(f)
-    m_I = primal.h.size
-    bound = friction.bound / scale[m_I:]
-    qp = QP(
-        P=dual_operator(B, bodies.domains, m_E, bodies.clusters, bodies.redundant),
-        q=bodies.c - B @ free,
-        A=csr_array((B @ R).T),
-        b=R.T @ f,
-        G=no_rows(bodies.c.size),
-        h=np.zeros(0),
-        sets=multiplier_sets(m_E, m_I, bound, friction.tangents),
-    )
-    copies = np.asarray(T.multiply(T).sum(axis=0)).ravel()
-    copies[copies == 0] = 1  # eliminated components have no copy, and u = 0 there
+    dual = TornDual(served, lead or Lead(served.torn.comm, served))
     B_I = contact_rows(primal, friction)[0]
 
-    def displacement(s: Solution) -> Vector:
-        v = units.inverse(f - B.T @ s.x) - R @ s.y
-        return np.asarray((T.T @ v) / copies)
-
     def recover(s: Solution) -> Solution:
-        u, z = displacement(s), scale * s.x[m_E:]
+        u, z = dual.displacement(s), dual.multipliers(s)
         reactions = -primal.A @ (primal.P @ u + primal.q + B_I.T @ z)
         return replace(s, x=u, y=reactions, z=z, z_box=np.zeros(u.size))
 
-    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), displacement)
+    constant = -0.5 * float(dual.torn.f @ dual.free)
+    return Transformed(dual.qp, recover, -1.0, constant, dual.displacement)
 
 
-def feti_matrices(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
+def digest_of(torn: TornBodies, others: int = 0) -> str:
+    """Return a digest of the dual that does not depend on the number of ranks.
+
+    The rounding of q depends on the number of ranks. Therefore the digest contains the
+    classes of the subdomains, B, c, f and the friction bounds instead. If the dual
+    follows from solutions of `others` previous problems, which have rounding errors
+    too, it contains the data of the first of these problems and their number. All
+    ranks must call this function together.
+    """
+    domains, (B, c, _) = torn.domains, torn.rows
+    own = {k: domains.template(k).name for k, _ in domains.own}
+    names = {k: name for one in torn.comm.gather(own) for k, name in one.items()}
+    arrays = (domains.class_of, B.indptr, B.indices, B.data, c, torn.f)
+    text = (names[k].encode() for k in sorted(names))
+    data = (x.tobytes() for x in (*arrays, torn.problem.contact.bound))
+    digest = hex_digest((*text, *data, str(others).encode()), 64)
+    return torn.comm.bcast(digest)
+
+
+def feti_matrices(served: Served, dual: QP) -> dict[str, Any]:
     """Return F, d, B, c and R of the dual, keyed by their names in the paper."""
-    R = bodies.units.kernel
-    return {"F": dual.P, "d": -dual.q, "B": bodies.B, "c": bodies.c, "R": R}
+    B, c, _ = served.torn.rows
+    return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": served.domains.kernel()}
 
 
-def decomposition_quantities(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
+def decomposition_quantities(served: Served, dual: QP) -> dict[str, Any]:
     """Return the quantities that describe the size of a decomposition.
 
     * `subdomains`: number of subdomains
     * `kinds`: number of classes of congruent subdomains; each class has one factor
     * `torn_dofs`: number of displacement unknowns, including all copies
     * `multipliers`: number of rows of B
-    * `coarse_unknowns`: number of rigid motions of all subdomains or clusters
+    * `coarse_unknowns`: number of rigid motions of all subdomains
     * `explicit_subdomains`: number of subdomains with explicit blocks (K⁺)_bb and S_bb;
       for all other subdomains, every product requires a solve
-    * `explicit_mib`: memory for these blocks, MiB
+    * `explicit_mib`: memory for these blocks, MiB, stored once
     """
-    explicit = dual.P.arrays["explicit"]
-    sizes = np.array(
-        [part.size for part in touched_components(bodies.B, bodies.domains)]
-    )
-    taken = block_bytes(sizes, bodies.domains)
+    domains, B = served.domains, served.torn.rows.B
+    explicit = served.operator.explicit
+    sizes = np.array([part.size for part in touched_components(B, domains)])
     return {
-        "subdomains": bodies.class_of.size,
-        "kinds": len(bodies.classes),
-        "torn_dofs": bodies.f.size,
-        "multipliers": bodies.c.size,
+        "subdomains": domains.class_of.size,
+        "kinds": domains.sizes.size,
+        "torn_dofs": int(domains.start[-1]),
+        "multipliers": B.shape[0],
         "coarse_unknowns": dual.b.size,
-        "explicit_subdomains": int(explicit[bodies.class_of].sum()),
-        "explicit_mib": float(taken[explicit].sum() / 2**20),
+        "explicit_subdomains": int(explicit[domains.class_of].sum()),
+        "explicit_mib": float(block_bytes(sizes, domains)[explicit].sum() / 2**20),
     }

@@ -334,7 +334,7 @@ class DisplacedMesh(NamedTuple):
 
 
 class ContactSolution(Protocol):
-    """Solution of a contact problem; all ranks must call its members together."""
+    """Solution of a contact problem."""
 
     @property
     def sides(self) -> InterfaceState:
@@ -348,10 +348,7 @@ class ContactSolution(Protocol):
         """Return the nondimensional displacement at global components (k,)."""
 
     def meshes(self) -> Iterator[DisplacedMesh]:
-        """Yield displaced meshes; those of all ranks together form all bodies."""
-
-    def largest(self, value: float) -> float:
-        """Return the maximum of a value over all ranks."""
+        """Yield displaced meshes, which together form all bodies."""
 
 
 def no_further_results(solution: ContactSolution) -> dict[str, Any]:
@@ -387,12 +384,10 @@ class Choice(NamedTuple):
     iterate: int = 0
     size: int = 0  #: argument of `Shape.layout`; 0 for undivided bodies
     glue: str = "orthonormal"  #: one of `problems.feti.subdomains.GLUE`
-    #: number of subdomains along a side of a cluster; 0 for no clusters
-    cluster: int = 0
 
 
 #: keys of a case that select one of the QPs of a problem
-CHOICES = ("step", "iterate", "feti", "parts", "glue", "cluster")
+CHOICES = ("step", "iterate", "feti", "parts", "glue")
 
 
 def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
@@ -416,7 +411,6 @@ def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
         p.get("iterate", 0),
         size,
         p.get("glue", "orthonormal"),
-        p.get("cluster", 0),
     )
 
 

@@ -22,8 +22,14 @@ from mortarbench.problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, ReferenceOverRanks, Value
-    from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
+    from mortarbench.harness import (
+        Case,
+        CaseOnRanks,
+        Reference,
+        ReferenceOfOperator,
+        Value,
+    )
+    from mortarbench.harness.distributed.comm import Comm
     from mortarbench.problems.duality.problem import ContactProblem
 
 
@@ -34,10 +40,8 @@ class DeclaredFamily(Family):
     ----------
     keys : keys in the order of canonical names
     model : "MODULE.FUNCTION" of `problems.models` that returns the case. The parameters
-        of the function may be form, params, reference and individual keys
-    subdomains : module of `problems.models` whose `in_subdomains` returns the
-        decomposed problem and whose `results` returns a function that evaluates
-        solutions on ranks; empty if the family has no such module
+        of the function may be form, params, reference and individual keys. If the
+        family has subdomains, the function MODULE.on_ranks builds a case on ranks
     cells : keys that are numbers of cells; refinement doubles the values unless there
         is a key `halvings`
     conditions : mapping from a key to a check that involves several keys; the check
@@ -47,7 +51,6 @@ class DeclaredFamily(Family):
 
     keys: ClassVar[Keys] = MappingProxyType({})
     model: ClassVar[str]
-    subdomains: ClassVar[str] = ""
     cells: ClassVar[tuple[str, ...]] = ()
     conditions: ClassVar[Mapping[str, Callable[[str, Mapping[str, Value]], None]]] = {
         "friction": check_friction,
@@ -100,26 +103,34 @@ class DeclaredFamily(Family):
         size = params.get("feti") or params.get("parts")
         return bool(size) and params.get("kinematics") != "finite"
 
-    def emission(
-        self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
-        """Return a function that assembles the local part of the dual on a rank.
+    def subdomains(self, form: str, params: Mapping[str, Value]) -> int:
+        """Return the number of subdomains, or 1 for undivided bodies."""
+        if form != "dual" or not self.is_divided(params):
+            return 1
+        return self.parts(params)
 
-        Return None if one process must assemble the whole case.
-        """
+    def parts(self, params: Mapping[str, Value]) -> int:
+        """Return the number of subdomains of decomposed bodies."""
+        module = self.model.partition(".")[0]
+        return int(_model(f"{module}.in_subdomains")(params).layout.count)
+
+    def on_ranks(
+        self, form: str, params: Mapping[str, Value]
+    ) -> Callable[[Comm, ReferenceOfOperator], CaseOnRanks] | None:
+        """Return a function that builds the case on several ranks, or None."""
         if form != "dual" or not self.is_divided(params):
             return None
-        return lambda ranks, reference: self.emitted(params, ranks, reference)
+        return lambda comm, reference: self.built_on(comm, params, reference)
 
-    def emitted(
-        self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
-    ) -> DistributedQP:
-        """Return the local part of the dual on this rank (collective call)."""
-        from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
-
+    def built_on(
+        self, comm: Comm, params: Mapping[str, Value], reference: ReferenceOfOperator
+    ) -> CaseOnRanks:
+        """Build the dual of decomposed bodies (all ranks call this together)."""
         del reference
-        dual = dual_on(_model(f"{self.subdomains}.in_subdomains")(params), ranks)
-        return distributed_qp(dual, _model(f"{self.subdomains}.results")(params, dual))
+        case: CaseOnRanks = _model(f"{self.model.partition('.')[0]}.on_ranks")(
+            params, comm
+        )
+        return case
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
@@ -169,16 +180,24 @@ class ContactFamily(DeclaredFamily):
         choice = qp_choice(form, params)
         return case_of(self.contact_problem(params), form, choice, reference)
 
-    def emitted(
-        self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
-    ) -> DistributedQP:
-        """Return the local part of the dual on this rank (collective call)."""
-        from mortarbench.problems.duality.decomposed import distributed_qp_of
+    def built_on(
+        self, comm: Comm, params: Mapping[str, Value], reference: ReferenceOfOperator
+    ) -> CaseOnRanks:
+        """Build the dual of decomposed bodies (all ranks call this together)."""
+        from mortarbench.problems.duality.decomposed import case_on_ranks
         from mortarbench.problems.duality.problem import qp_choice
 
         self.check(params)
         choice = qp_choice("dual", params)
-        return distributed_qp_of(ranks, self.contact_problem(params), choice, reference)
+        return case_on_ranks(comm, self.contact_problem(params), choice, reference)
+
+    def parts(self, params: Mapping[str, Value]) -> int:
+        """Return the number of subdomains of decomposed bodies."""
+        from mortarbench.problems.duality.decomposed import cached_layout
+        from mortarbench.problems.duality.problem import qp_choice
+
+        size = qp_choice("dual", params).size
+        return cached_layout(self.contact_problem(params).bodies, size).count
 
 
 def _model(place: str) -> Callable[..., Any]:

@@ -25,7 +25,6 @@ class Membranes(DeclaredFamily):
     keys = schema(S=key(2, 1), n=key(8, 1), **GLUES, **CLUSTERS)
     forms = ("primal", "dual")
     model = "membranes.membranes"
-    subdomains = "membranes"
     cells = ("n",)
 
     def check(self, params: Mapping[str, Value]) -> None:

@@ -47,7 +47,6 @@ class Plate(DeclaredFamily):
     )
     forms = ("primal", "dual")
     model = "plate.clamped_plate"
-    subdomains = "plate"
     cells = ("n", "ny")
 
     def check(self, params: Mapping[str, Value]) -> None:

@@ -2,59 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
-
 import numpy as np
 from scipy.sparse import block_diag, csc_array, csr_array
 
-from mortarbench.harness import QP
-from mortarbench.harness.distributed.vectors import Ranks, Share
 from mortarbench.harness.operators import Arrays, SerialisableOperator
-from mortarbench.problems.feti.distributed import local_share
-from mortarbench.problems.feti.operators import DualOperator, explicit_classes
-from mortarbench.problems.feti.subdomain_classes import (
-    Clusters,
-    SubdomainClass,
-    Subdomains,
-)
+from mortarbench.problems.feti.operators import DualOperator
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass, Subdomains
 
 NAME = "tfeti"  #: name in `problems.OPERATORS`, stored in files
 _PARTS = ("data", "indices", "indptr")
 _BY_CLASS = ("stiffness", "fixing", "boundary")  #: arrays with class-dependent lengths
 
 
-@dataclass(frozen=True, eq=False)
-class StoredOperator(DualOperator):
-    """Operator F restored from its arrays; it can be distributed over ranks."""
-
-    @property
-    def parts(self) -> int:
-        """Number of subdomains."""
-        return int(self.domains.class_of.size)
-
-    def share(self, qp: QP, ranks: Ranks) -> Share:
-        """Return the part of a dual QP with this F that this rank stores."""
-        return local_share(qp, self, ranks)
-
-
-def dual_operator(
-    B: csr_array,
-    domains: Subdomains,
-    equalities: int,
-    clusters: Clusters | None = None,
-    redundant: bool = False,
-) -> SerialisableOperator:
-    """Return F = BK⁺Bᵀ as a serialisable operator; each class is stored once.
-
-    Parameters
-    ----------
-    equalities : number of equality rows of B, which come first
-    clusters : clusters whose K̃⁺ replaces K⁺; None if averages join no subdomains
-    redundant : True if the equality rows may be linearly dependent
-
-    """
-    classes = domains.classes
+def dual_operator(F: DualOperator) -> SerialisableOperator:
+    """Return F = BK⁺Bᵀ as a serialisable operator; each class is stored once."""
+    domains = F.domains
+    classes = [domains.template(k) for k in range(domains.sizes.size)]
     K = csc_array(block_diag([template.K for template in classes], format="csc"))
     modes = np.array([template.R.shape[1] for template in classes])
     R = [
@@ -63,34 +26,26 @@ def dual_operator(
     ]
     arrays = {
         **{f"K_{part}": getattr(K, part) for part in _PARTS},
-        **{f"B_{part}": getattr(B, part) for part in _PARTS},
+        **{f"B_{part}": getattr(F.B, part) for part in _PARTS},
         "R": np.concatenate(R),
         "modes": modes,
         "stiffness": np.concatenate([template.stiffness for template in classes]),
         "fixing": np.concatenate([template.fixing for template in classes]),
         "boundary": np.concatenate([template.boundary for template in classes]),
         "kind": domains.class_of,
-        "explicit": explicit_classes(B, domains),
-        "equalities": np.array(equalities),
+        "explicit": F.explicit,
+        "equalities": np.array(F.equalities),
     }
     for name in _BY_CLASS:
         arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in classes])
-    if redundant:
+    if F.semidefinite:
         arrays["redundant"] = np.array(True)
-    if clusters is not None:
-        faces = csc_array(block_diag(clusters.faces, format="csc"))
-        arrays |= {
-            "cluster": clusters.cluster,
-            "faces_ends": np.cumsum([modes.shape[1] for modes in clusters.faces]),
-            **{f"faces_{part}": getattr(faces, part) for part in _PARTS},
-            **{f"joints_{part}": getattr(clusters.joints, part) for part in _PARTS},
-        }
     return SerialisableOperator(
-        B.shape[0], NAME, arrays, {NAME: dual_operator_from_arrays}
+        F.B.shape[0], NAME, arrays, {NAME: dual_operator_from_arrays}
     )
 
 
-def dual_operator_from_arrays(arrays: Arrays) -> StoredOperator:
+def dual_operator_from_arrays(arrays: Arrays) -> DualOperator:
     """Restore F from the arrays of `dual_operator`."""
     ends = [np.append(0, arrays[f"{name}_ends"]) for name in _BY_CLASS]
     data, indices, indptr = (arrays[f"K_{part}"] for part in _PARTS)
@@ -108,36 +63,17 @@ def dual_operator_from_arrays(arrays: Arrays) -> StoredOperator:
             stiffness=arrays["stiffness"][rows],
         )
 
+    sizes = np.diff(ends[0])
+    classes = [subdomain_class(k) for k in range(sizes.size)]
     domains = Subdomains(
-        tuple(map(subdomain_class, range(ends[0].size - 1))), arrays["kind"]
+        template=classes.__getitem__,
+        sizes=sizes,
+        class_of=arrays["kind"],
+        rank=np.zeros(arrays["kind"].size, dtype=np.int64),
     )
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
-    clusters = _clusters(arrays, domains) if "cluster" in arrays else None
-    return StoredOperator(
-        B,
-        domains,
-        arrays["explicit"],
-        int(arrays["equalities"]),
-        clusters=clusters,
-        redundant="redundant" in arrays,
-    )
-
-
-def _clusters(arrays: Arrays, domains: Subdomains) -> Clusters:
-    data, indices, indptr = (arrays[f"faces_{part}"] for part in _PARTS)
-    ends, row, faces = np.append(0, arrays["faces_ends"]), 0, []
-    for template, (begin, end) in zip(domains.classes, pairwise(ends), strict=True):
-        columns, n = indptr[begin : end + 1], template.K.shape[0]
-        within = slice(columns[0], columns[-1])
-        modes = data[within], indices[within] - row, columns - columns[0]
-        faces.append(csr_array(csc_array(modes, shape=(n, end - begin))))
-        row += n
-    joints = tuple(arrays[f"joints_{part}"] for part in _PARTS)
-    coordinates = int(np.diff(ends)[domains.class_of].sum())
-    return Clusters(
-        domains=domains,
-        cluster=arrays["cluster"],
-        faces=tuple(faces),
-        joints=csr_array(joints, shape=(joints[2].size - 1, coordinates)),
+    equalities = int(arrays["equalities"])
+    return DualOperator(
+        B, domains, arrays["explicit"], equalities, "redundant" in arrays
     )

@@ -37,25 +37,19 @@ face.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import (
-    block_diag,
-    csc_array,
-    csr_array,
-    diags_array,
-    eye_array,
-    kron,
-    vstack,
-)
+from scipy.sparse import csc_array, csr_array, diags_array, vstack
 from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness import Vector
+from mortarbench.harness.distributed.comm import Lead
 from mortarbench.harness.distributed.factor import bordered_factor
 from mortarbench.harness.distributed.sparse import (
     Composition,
@@ -63,13 +57,11 @@ from mortarbench.harness.distributed.sparse import (
     DirectSum,
     Identity,
     LinearMap,
-    Sum,
 )
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.blocks import BlockDiagonal
 from mortarbench.problems.feti.subdomain_classes import (
-    Clusters,
     Condensed,
     Dense,
     SubdomainClass,
@@ -86,29 +78,22 @@ STRIP_COLUMNS = 256
 CONTACT_SHIFT = 1e-8
 #: eigenvalues of a block of B W Bᵀ below this fraction of the largest count as zero
 EIGENVALUE_CUTOFF = 1e-10
-#: lower bound on the diagonal of B K̃⁺Bᵀ, relative to that of B K⁺Bᵀ. Residuals are
-#: scaled by 1/√diagonal; with this bound, relative rounding errors of 2⁻⁵³ are
-#: amplified to at most 1e5·2⁻⁵³, about 1e-11
-LEAST_DIAGONAL = 1e-10
 #: off-diagonal entries of B W Bᵀ below this fraction of the diagonal count as rounding
 #: errors
 COUPLING_ROUNDING = 1e-12
 
 
 class Group(NamedTuple):
-    """Subdomains of one class, with the union of the components that B touches."""
+    """Subdomains of one class on this rank, with the components that B touches.
 
+    The components are those that B touches in any subdomain of the class on any rank.
+    """
+
+    number: int  #: number of the class
     template: SubdomainClass
     explicit: bool  #: True if (K⁺)_bb is computed in advance
     members: NDArray[np.int64]  #: (S_g,) subdomains
     touched: Nodes  #: b (n_g,) components within a subdomain, ascending
-
-
-def condense_groups(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
-    """Yield the index of each group with its blocks (K⁺)_bb and S_bb."""
-    return (
-        (i, group.template.condense(group.touched)) for i, group in enumerate(groups)
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,21 +152,24 @@ class Packed:
 
 
 def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
-    """Pack the columns of B (m, N) for the touched components, class by class.
+    """Pack the columns of B (m, N) that this rank touches, class by class.
 
     explicit : (classes,) True for classes with explicit blocks
     """
     groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
     parts = touched_components(B, domains)
-    for k, (template, members) in enumerate(
-        zip(domains.classes, domains.members, strict=True)
-    ):
-        groups.append(Group(template, bool(explicit[k]), members, parts[k]))
+    for k, members in domains.own:
+        group = Group(k, domains.template(k), bool(explicit[k]), members, parts[k])
+        groups.append(group)
         unknowns = domains.start[members] + parts[k][:, None]
         number[unknowns.ravel()] = np.arange(end, end + unknowns.size)
         end += unknowns.size
-    indices = number[B.indices].astype(B.indices.dtype)
-    B_b = csr_array((B.data, indices, B.indptr), shape=(B.shape[0], end))
+    places = number[B.indices]
+    here = places >= 0  # the columns of other ranks are dropped
+    ends = np.concatenate([[0], np.cumsum(here)])[B.indptr]
+    indices = places[here].astype(B.indices.dtype)
+    packed = (B.data[here], indices, ends.astype(B.indptr.dtype))
+    B_b = csr_array(packed, shape=(B.shape[0], end))
     return Packed(tuple(groups), B_b, csr_array(B_b.T))
 
 
@@ -191,53 +179,53 @@ def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
     columns[B.indices] = True
     unknowns = np.flatnonzero(columns)
     subdomain = np.searchsorted(domains.start, unknowns, side="right") - 1
-    largest = int(np.diff(domains.start).max())
+    largest = int(domains.sizes.max())
     class_of, component = np.divmod(
         np.unique(
             domains.class_of[subdomain] * largest + unknowns - domains.start[subdomain]
         ),
         largest,
     )
-    ends = np.cumsum(np.bincount(class_of, minlength=len(domains.classes)))
+    ends = np.cumsum(np.bincount(class_of, minlength=domains.sizes.size))
     return np.split(component, ends[:-1])
 
 
 @dataclass(frozen=True, eq=False)
 class DualOperator:
-    """The operator F of decomposed bodies, applied to arrays (m,) or (m, k)."""
+    """The operator F of decomposed bodies, applied to arrays (m,) or (m, k).
+
+    On several ranks, each rank applies the part of its subdomains. All ranks must call
+    each method together, and the results are valid on rank 0 (`OperatorOnRanks`).
+    """
 
     B: csr_array  #: (m, N) rows on all torn unknowns
     domains: Subdomains
     explicit: NDArray[np.bool_]  #: (classes,) True for classes with explicit blocks
     equalities: int  #: number of equality rows, which come first; contact rows follow
-    #: yields (K⁺)_bb and S_bb of explicit groups in any order, together with the index
-    #: of the group in the argument
-    condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
-        condense_groups
-    )
-    clusters: Clusters | None = None  #: None if averages join no subdomains
-    redundant: bool = False  #: True if the equality rows may be linearly dependent
-
-    @property
-    def semidefinite(self) -> bool:
-        """True if Fλ = 0 for some λ ≠ 0."""
-        return self.redundant or self.clusters is not None
+    semidefinite: bool = False  #: True if Fλ = 0 for some λ ≠ 0: redundant rows
 
     def __call__(self, x: Dense) -> Dense:
         """Return Fx."""
-        return self.linear_map(x)
+        return self.domains.comm.sum(self.linear_map(x))
 
     @cached_property
     def linear_map(self) -> Composition:
-        """F as a composition of compiled linear maps."""
-        return self.packed.congruence(self.inverse_map)
+        """The part of F of this rank as a composition of compiled linear maps."""
+        inverses = self.packed.block_diagonal(self._blocks[0])
+        return self.packed.congruence(inverses)
+
+    def prepare(self) -> None:
+        """Factorise the subdomains of this rank."""
+        _ = self.linear_map
 
     def diagonal(self) -> Vector:
-        """Return the diagonal of F, (m,); with clusters, see `LEAST_DIAGONAL`."""
+        """Return the diagonal of F, (m,)."""
         return self._diagonal
 
-    def preconditioner(self, kind: str, scaling: str) -> Composition:
+    def preconditioner(self, kind: str, scaling: str) -> LinearMap:
         """Return the map x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for x (m,) or (m, k).
+
+        On several ranks, this is the map `outer` of `preconditioner_parts` only.
 
         Parameters
         ----------
@@ -250,28 +238,42 @@ class DualOperator:
             If `kind` or `scaling` is not one of these names.
 
         """
+        outer, inner = self.preconditioner_parts(kind, scaling)
+        return Composition(outer, inner, outer)
+
+    def precondition(self, kind: str, scaling: str, x: Dense) -> Dense:
+        """Apply the map `inner` of `preconditioner_parts` of all ranks."""
+        inner = self.preconditioner_parts(kind, scaling)[1]
+        return self.domains.comm.sum(inner(x))
+
+    def preconditioner_parts(
+        self, kind: str, scaling: str
+    ) -> tuple[LinearMap, LinearMap]:
+        """Return two maps with B_D diag(D) B_Dᵀ = outer · inner · outer.
+
+        outer : applies (B W Bᵀ)⁻¹ to contact rows, for which it is dense
+        inner : contribution of the subdomains of this rank
+        """
         if (kind, scaling) not in self._preconditioners:
             blocks, weights = self.weighted_blocks(kind, scaling)
-            BW = scaled_columns(self.packed.B, weights)
-            gram = decouple_contact(csr_array(BW @ self.packed.BT), self.equalities)
-            E, (inverse, contact) = (
-                self.equalities,
-                gram_inverses(gram, self.equalities),
-            )
-            # (B W Bᵀ)⁺ is as sparse as B for equality rows, but dense for contact rows
+            packed, E, comm = self.packed, self.equalities, self.domains.comm
+            BW = scaled_columns(packed.B, weights)
+            grams = comm.gather(csr_array(BW @ packed.BT))
+            gram = csr_array(sum(grams[1:], start=grams[0])) if grams else None
+            # (B W Bᵀ)⁺ is as sparse as B for equality rows
+            inverse, contact = comm.bcast(gram and gram_inverses(gram, E))
             B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
-            solve = DirectSum(Identity(E), contact)
-            self._preconditioners[kind, scaling] = Composition(
-                solve,
+            inner = Composition(
                 CompressedRows(B_D),
-                self.stiffness_map(blocks, weights),
+                packed.block_diagonal(blocks),
                 CompressedRows(csr_array(B_D.T)),
-                solve,
             )
+            outer = DirectSum(Identity(E), contact_factor(contact))
+            self._preconditioners[kind, scaling] = outer, inner
         return self._preconditioners[kind, scaling]
 
     @cached_property
-    def _preconditioners(self) -> dict[tuple[str, str], Composition]:
+    def _preconditioners(self) -> dict[tuple[str, str], tuple[LinearMap, LinearMap]]:
         return {}
 
     def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
@@ -293,7 +295,7 @@ class DualOperator:
         blocks = (
             [g.template.block(g.touched) for g in groups]
             if kind == "lumped"
-            else self._blocks.schur
+            else self._blocks[1]
         )
         softness = [
             np.repeat(1 / g.template.stiffness[g.touched], g.members.size)
@@ -304,218 +306,98 @@ class DualOperator:
             weights = np.ones_like(weights)
         return blocks, weights
 
-    def stiffness_map(self, blocks: Sequence[Any], weights: Vector) -> LinearMap:
-        """Return diag(D) on packed components; with clusters, see `average_free`.
-
-        blocks, weights : from `weighted_blocks`
-        """
-        separate = self.packed.block_diagonal(blocks)
-        if self.clusters is None:
-            return separate
-        return average_free(self.clusters, self.packed, separate, weights)
-
     @cached_property
     def packed(self) -> Packed:
-        """Rows of B restricted to the components they touch."""
+        """Rows of B restricted to the components they touch on this rank."""
         return pack(self.B, self.domains, self.explicit)
-
-    @property
-    def inverses(self) -> list[Any]:
-        """(K⁺)_bb of each group: a matrix, a triangle of it, or an object with `@`."""
-        return self._blocks.inverses
-
-    @property
-    def inverse_map(self) -> LinearMap:
-        """diag((K⁺)_bb), or (K̃⁺)_bb with clusters, as a map on packed components."""
-        return self._blocks.inverse_map
 
     @cached_property
     def _diagonal(self) -> Vector:
-        diagonal, joints = self.packed.diagonal(self.inverses), self._blocks.joints
-        if joints is None:
-            return diagonal
-        # if Cv = 0 implies that a row of Bv is zero, the diagonal entry of F for this
-        # row is only a rounding error, and residuals scaled by this entry would be of
-        # order one
-        joined = diagonal + joints.diagonal(self.packed.B)
-        return np.maximum(joined, LEAST_DIAGONAL * diagonal)
+        return self.domains.comm.sum(self.packed.diagonal(self._blocks[0]))
 
     @cached_property
-    def _blocks(self) -> _Blocks:
-        groups = self.packed.groups
-        blocks_of = {i: _implicit(g) for i, g in enumerate(groups) if not g.explicit}
-        explicit = [i for i, g in enumerate(groups) if g.explicit]
-        for at, condensed in self.condense([groups[i] for i in explicit]):
-            blocks_of[explicit[at]] = _explicit(groups[explicit[at]], condensed)
-        inverses, schur = (
-            [blocks_of[i][k] for i in range(len(groups))] for k in (0, 1)
-        )
-        separate = self.packed.block_diagonal(inverses)
-        if self.clusters is None:
-            return _Blocks(inverses, schur, separate, None)
-        joints = _joints(self.clusters, self.packed, inverses)
-        joined = Sum(separate, joints.linear_map)
-        return _Blocks(inverses, schur, joined, joints)
+    def _blocks(self) -> tuple[list[Any], list[Any]]:
+        """(K⁺)_bb and S_bb of each group: matrices, triangles, or objects with `@`."""
+        groups, blocks = self.packed.groups, dict[int, tuple[Any, Any]]()
+        for group, condensed in condensed_groups(groups, self.domains):
+            blocks[group.number] = _explicit(group, condensed)
+        both = [blocks.get(g.number) or _implicit(g) for g in groups]
+        return [one[0] for one in both], [one[1] for one in both]
 
 
-class _Blocks(NamedTuple):
-    """Local blocks of each group: matrices, upper triangles, or objects with `@`."""
+def condensed_groups(
+    groups: Sequence[Group], domains: Subdomains
+) -> Iterator[tuple[Group, Condensed]]:
+    """Yield the explicit groups of this rank with their blocks (K⁺)_bb and S_bb.
 
-    inverses: list[Any]  #: (K⁺)_bb
-    schur: list[Any]  #: S_bb
-    inverse_map: LinearMap  #: diag((K⁺)_bb), or (K̃⁺)_bb
-    joints: _Joints | None  #: (K̃⁺)_bb − diag((K⁺)_bb); None without clusters
+    If a class occurs on several ranks, one of them computes its blocks for all. Classes
+    are assigned in the order of decreasing work to the rank with the least work so far
+    (longest processing time first, Graham 1969). All ranks call this together.
+    """
+    comm, explicit = domains.comm, {g.number: g for g in groups if g.explicit}
+    work = {k: g.template.K.nnz * g.touched.size for k, g in explicit.items()}
+    offered = comm.bcast(comm.gather(work))
+    size = {k: w for one in offered for k, w in one.items()}
+    loads, computes = [0] * comm.size, dict[int, int]()
+    for k in sorted(size, key=lambda k: (-size[k], k)):
+        ranks = [r for r, one in enumerate(offered) if k in one]
+        computes[k] = min(ranks, key=loads.__getitem__)
+        loads[computes[k]] += size[k]
+    shared = [k for k in size if sum(k in one for one in offered) > 1]
+    blocks = {}
+    for k, group in explicit.items():
+        if computes[k] == comm.rank:
+            condensed = group.template.condense(group.touched)
+            if k in shared:
+                blocks[k] = condensed
+            else:
+                yield group, condensed
+    for k in shared:
+        condensed = comm.bcast(blocks.pop(k, None), computes[k])
+        if k in explicit:
+            yield explicit[k], condensed
 
 
-@dataclass(frozen=True, eq=False)
-class _Joints:
-    """The term −V M⁺Vᵀ of `Clusters` on packed components.
+class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no types
+    """The operator F on rank 0; each product is a call of all ranks.
 
-    The columns of V for a subdomain are linear combinations of the columns
-    [(K⁺Φ)_b, R_b] of its class.
+    lead : calls methods of an object on all ranks whose attribute `operator` is a
+        `DualOperator`
     """
 
-    groups: tuple[Group, ...]
-    columns: list[Dense]  #: [(K⁺Φ)_b, R_b] (n_g, p_g) of each group
-    #: (k, p) coefficients of V, one row for each of the unknowns (μ_1, α_1, μ_2, α_2,
-    #: …) of clusters; the columns are packed like components
-    combine: csr_array
-    saddle_inverses: list[Vector]  #: upper triangle of M⁺ for each cluster
-    sizes: list[int]  #: number of unknowns of each cluster
+    def __init__(self, lead: Lead, operator: DualOperator) -> None:
+        m = operator.B.shape[0]
+        super().__init__(np.dtype(float), (m, m))
+        self._lead = lead
+        self.semidefinite = operator.semidefinite
 
-    @property
-    def linear_map(self) -> Composition:
-        """The term −V M⁺Vᵀ as a map on packed components."""
-        members = [group.members.size for group in self.groups]
-        sizes = [group.touched.size for group in self.groups]
-        rows = [np.ascontiguousarray(block.T) for block in self.columns]
-        return Composition(
-            BlockDiagonal(self.columns, [len(block) for block in rows], members),
-            CompressedRows(csr_array(-self.combine.T)),
-            BlockDiagonal(self.saddle_inverses, self.sizes, [1] * len(self.sizes)),
-            CompressedRows(self.combine),
-            BlockDiagonal(rows, sizes, members),
-        )
+    def build(self) -> OperatorOnRanks:
+        """Factorise the subdomains on all ranks."""
+        self._lead("operator.prepare")
+        return self
 
-    def diagonal(self, B: csr_array) -> Vector:
-        """Return the diagonal of −BV M⁺VᵀBᵀ (m,) for packed rows B."""
-        columns = [
-            kron(csr_array(block), eye_array(group.members.size), format="csr")
-            for group, block in zip(self.groups, self.columns, strict=True)
-        ]
-        U = csc_array(B @ (block_diag(columns, format="csr") @ self.combine.T))
-        total, end = np.zeros(B.shape[0]), 0
-        for n, triangle in zip(self.sizes, self.saddle_inverses, strict=True):
-            inverse = BlockDiagonal([triangle], [n], [1])(np.eye(n))
-            part = U[:, end : end + n]
-            rows = np.unique(part.indices)
-            part, end = csr_array(part[rows]), end + n
-            for begin in range(0, rows.size, STRIP_COLUMNS):
-                strip = slice(begin, begin + STRIP_COLUMNS)
-                u = part[strip].toarray()
-                total[rows[strip]] -= np.einsum("ij,ij->i", u @ inverse, u)
-        return total
+    def forget(self) -> None:
+        """Discard all factors; the next product computes them again."""
+        self._lead("forget")
 
+    def diagonal(self) -> Vector:
+        """Return the diagonal of F, (m,)."""
+        return np.asarray(self._lead("operator.diagonal"))
 
-def average_free(
-    clusters: Clusters, packed: Packed, D: LinearMap, weights: Vector
-) -> Composition:
-    """Return (I − Π)D(I − Π)ᵀ with Π = Cᵀ(CWCᵀ)⁺CW, for packed components.
+    def preconditioner(self, kind: str, scaling: str) -> Product:
+        """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
+        outer, _ = self._lead("operator.preconditioner_parts", kind, scaling)
+        inner = partial(self._lead, "operator.precondition", kind, scaling)
+        return lambda x: outer(inner(outer(x)))
 
-    F vanishes on all multipliers with Bᵀλ = Cᵀμ. Rounding errors would therefore let
-    the iterates of preconditioned conjugate gradients drift along these multipliers.
-    The range of B_DΠ consists of such multipliers, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0
-    because C = LᵀB for some L. Hence the factors I − Π change the image of the
-    preconditioner only by such multipliers, and remove its component along them.
+    def _matvec(self, x: Vector) -> Vector:
+        return np.asarray(self._lead("operator", x))
 
-    weights : (M,) diagonal of W, equal for all subdomains of a class
-    """
-    members = [group.members.size for group in packed.groups]
-    modes, weighted, grams, end = [], [], [], 0
-    for group, faces in zip(packed.groups, clusters.faces, strict=True):
-        Phi = faces[group.touched].toarray()
-        w = weights[end : end + Phi.shape[0] * group.members.size : group.members.size]
-        end += Phi.shape[0] * group.members.size
-        modes.append(Phi)
-        weighted.append(w[:, None] * Phi)
-        grams.append(Phi.T @ weighted[-1])
-    place = _column_places(clusters, packed, [Phi.shape[1] for Phi in modes])
-    C = csr_array(
-        (clusters.joints.data, place[clusters.joints.indices], clusters.joints.indptr),
-        clusters.joints.shape,
-    )
-    q = [Phi.shape[1] for Phi in modes]
-    n = [Phi.shape[0] for Phi in modes]
+    def _matmat(self, X: Dense) -> Dense:
+        return np.asarray(self._lead("operator", X))
 
-    def oblique(left: list[Dense], right: list[Dense]) -> Sum:
-        rows = [np.ascontiguousarray(block.T) for block in right]
-        sizes = np.diff(clusters.rows).tolist()
-        minus_joined = Composition(
-            BlockDiagonal(left, q, members),
-            CompressedRows(csr_array(-C.T)),
-            BlockDiagonal(clusters.gram_inverses(grams), sizes, [1] * len(sizes)),
-            CompressedRows(C),
-            BlockDiagonal(rows, n, members),
-        )
-        return Sum(Identity(D.shape[0]), minus_joined)
-
-    return Composition(oblique(modes, weighted), D, oblique(weighted, modes))
-
-
-def _column_places(
-    clusters: Clusters, packed: Packed, sizes: Sequence[int]
-) -> NDArray[np.int64]:
-    """Return the indices (Σq,) of the coordinates of `Clusters`, packed by groups.
-
-    sizes : number of columns of each group; the columns of the coordinates come first
-    """
-    first = clusters.coordinates
-    place, end = np.empty(first[-1], dtype=np.int64), 0
-    for group, faces, p in zip(packed.groups, clusters.faces, sizes, strict=True):
-        members, q = group.members, np.arange(faces.shape[1])[:, None]
-        number = end + q * members.size + np.arange(members.size)
-        place[first[members] + q] = number
-        end += p * members.size
-    return place
-
-
-def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joints:
-    """Compute the term −V M⁺Vᵀ of clusters from the blocks (K⁺)_bb of the groups."""
-    columns, compliance, end = list[Dense](), list[Dense](), 0
-    modes = clusters.domains.modes
-    first_motion = np.cumsum(modes) - modes
-    motion = np.empty(modes.sum(), dtype=np.int64)  # indices of packed columns
-    for group, inverse, faces in zip(
-        packed.groups, inverses, clusters.faces, strict=True
-    ):
-        Phi = faces[group.touched].toarray()
-        image = BlockDiagonal([inverse], [group.touched.size], [1])(Phi)
-        compliance.append(Phi.T @ image)
-        columns.append(np.hstack([image, group.template.R[group.touched]]))
-        (q, p), members = (Phi.shape[1], columns[-1].shape[1]), group.members
-        place = end + np.arange(p * members.size).reshape(p, members.size)
-        motion[first_motion[members] + np.arange(p - q)[:, None]] = place[q:]
-        end += place.size
-    coordinate = _column_places(clusters, packed, [M.shape[1] for M in columns])
-    order, sizes = clusters.unknowns
-    C = clusters.joints
-    combine = vstack(
-        [
-            csr_array((C.data, coordinate[C.indices], C.indptr), (C.shape[0], end)),
-            csr_array(
-                (np.ones(motion.size), motion, np.arange(motion.size + 1)),
-                (motion.size, end),
-            ),
-        ],
-        format="csr",
-    )
-    return _Joints(
-        packed.groups,
-        columns,
-        csr_array(combine[order]),
-        clusters.saddle_inverses(compliance),
-        sizes,
-    )
+    def _adjoint(self) -> OperatorOnRanks:
+        return self
 
 
 def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:
@@ -580,18 +462,22 @@ def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
     return csr_array(parts, shape=gram.shape)
 
 
-def gram_inverse(gram: csr_array, equalities: int) -> LinearMap:
-    """Return x ↦ (B W Bᵀ)⁺x; `gram` is a result of `decouple_contact`."""
-    inverse, contact = gram_inverses(gram, equalities)
-    return DirectSum(CompressedRows(inverse), contact)
+def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, csc_array]:
+    """Return (B W Bᵀ)⁺ of equality rows, and the block B W Bᵀ of contact rows.
 
-
-def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, LinearMap]:
-    """Return (B W Bᵀ)⁺ of equality rows as a matrix, and of contact rows as a map."""
+    The block is made regular by `CONTACT_SHIFT`.
+    """
+    gram = decouple_contact(gram, equalities)
     inverse = block_pseudoinverse(gram[:equalities, :equalities])
     contact = csc_array(gram[equalities:, equalities:])
-    contact += diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
-    return inverse, bordered_factor(contact, np.zeros(0, dtype=np.int64))
+    return inverse, csc_array(
+        contact + diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
+    )
+
+
+def contact_factor(contact: csc_array) -> LinearMap:
+    """Factorise the block of contact rows of `gram_inverses`."""
+    return bordered_factor(contact, np.zeros(0, dtype=np.int64))
 
 
 def block_pseudoinverse(M: csr_array) -> csr_array:
@@ -645,5 +531,5 @@ def block_bytes(sizes: NDArray[np.int64], domains: Subdomains) -> NDArray[np.int
 
     sizes : (classes,) number of components of the blocks
     """
-    alone = np.array([members.size == 1 for members in domains.members])
+    alone = np.bincount(domains.class_of, minlength=sizes.size) == 1
     return np.where(alone, 8 * sizes * (sizes + 1), 16 * sizes**2)

@@ -1,9 +1,7 @@
 """Extreme eigenvalues of F on the null space of the equalities, with error bounds.
 
 Let G = RᵀBᵀ be the matrix of the equalities of the dual, and P the orthogonal projector
-onto ker G ∩ range B. If averages join subdomains into clusters, F is singular on this
-subspace, and P projects onto the part of the subspace that is orthogonal to ker F. The
-spectra are those of
+onto ker G ∩ range B. The spectra are those of
 
     P F P                 in the inner product  xᵀy,
     P M P F               in the inner product  xᵀF y,
@@ -26,13 +24,12 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh_tridiagonal
-from scipy.sparse import csc_matrix, csr_array, vstack
+from scipy.sparse import csc_matrix, csr_array
 from sksparse.cholmod import cholesky
 
-from mortarbench.harness import Vector
-from mortarbench.harness.distributed.vectors import DistributedColumns
-from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.distributed import RankOperator
+from mortarbench.harness import QP, Vector
+from mortarbench.harness.operators import preconditioned
+from mortarbench.problems.feti.operators import block_pseudoinverse, decouple_contact
 
 Product = Callable[[Vector], Vector]
 
@@ -77,9 +74,6 @@ def spectrum(
     n: int,
     M: Product | None = None,
     tol: float = 1e-5,
-    *,
-    rows: Nodes | None = None,
-    total: Product = np.asarray,
 ) -> Spectrum:
     """Compute the extreme eigenvalues of PFP, or of PMPF, on the range of P.
 
@@ -89,37 +83,32 @@ def spectrum(
     P : orthogonal projector of vectors (n,)
     M : preconditioner, symmetric positive semidefinite
     tol : bound on the relative error of both extreme eigenvalues
-    rows : components on this rank; None for all n components
-    total : function that returns, on each rank, the sum over all ranks of arrays (k,)
 
     """
-    local = np.arange(n) if rows is None else rows
-
-    def dot(x: Vector, y: Vector) -> float:
-        return float(total(np.atleast_1d(x @ y))[0])
-
     # the inner product is xᵀWy; `metric` maps x to Wx, and `image` maps Wx to the image
     # of x under the operator
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + local**2))  # arbitrary vector, rarely orthogonal to eigenvectors
-    V = np.empty((_CHUNK, local.size))
+    v = P(
+        np.sin(1.0 + np.arange(n) ** 2)
+    )  # arbitrary vector, rarely orthogonal to eigenvectors
+    V = np.empty((_CHUNK, n))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
     Wv = metric(v)
-    length = float(np.sqrt(dot(v, Wv)))
+    length = float(np.sqrt(v @ Wv))
     for k in range(n):
         if k == len(V):
-            more = np.empty((_CHUNK, local.size))
+            more = np.empty((_CHUNK, n))
             V = np.concatenate([V, more])
             WV = V if M is None else np.concatenate([WV, more])
         V[k], WV[k] = v / length, Wv / length
         v = image(WV[k])
-        alpha.append(dot(v, WV[k]))
+        alpha.append(float(v @ WV[k]))
         v -= alpha[-1] * V[k] + (beta[-1] * V[k - 1] if k else 0.0)
-        v = P(v - total(WV[: k + 1] @ v) @ V[: k + 1])
+        v = P(v - (WV[: k + 1] @ v) @ V[: k + 1])
         Wv = metric(v)
-        length = float(np.sqrt(max(dot(v, Wv), 0.0)))
+        length = float(np.sqrt(max(v @ Wv, 0.0)))
         over = length <= BREAKDOWN * max(alpha)
         if over or k % CHECK_INTERVAL == CHECK_INTERVAL - 1 or k == n - 1:
             result = ritz_bounds(np.array(alpha), np.array(beta), length)
@@ -129,69 +118,46 @@ def spectrum(
     return result
 
 
-def spectra_over_ranks(
-    F: RankOperator,
-    G: DistributedColumns,
+def spectra(
+    qp: QP,
+    B: csr_array,
     preconditioners: Sequence[tuple[str, str] | None] = (None,),
     tol: float = 1e-5,
 ) -> list[Spectrum]:
     """Compute the extreme eigenvalues of PFP, or of PMPF for each preconditioner M.
 
-    F acts on the multipliers of supports and gluing. All ranks must call this function
-    together; the results are equal on all ranks.
-
     Parameters
     ----------
-    F, G : operator F and equality rows RᵀBᵀ of the dual of a problem without contact;
-        the supports must exclude rigid motions of every body
+    qp : dual of a problem without contact; the supports must exclude rigid motions of
+        every body
+    B : (m, N) rows of supports and gluing, which may be linearly dependent
     preconditioners : kind and scaling of each, see `problems.feti.operators`; None
         selects PFP without a preconditioner
     tol : bound on the relative error of both extreme eigenvalues
 
     """
-    halo, ranks = F.halo, F.halo.ranks
-    m = ranks.total(np.array([float(halo.owned.size)]))[0]
-    project = projector(F, G)
-
-    def plain(A: Product) -> Product:
-        return lambda x: np.asarray(A(x))
-
-    inverses = [p and plain(F.preconditioner(*p)) for p in preconditioners]
-    return [
-        spectrum(
-            plain(F),
-            project,
-            int(m),
-            M,
-            tol,
-            rows=halo.rows[halo.owned],
-            total=ranks.total,
-        )
-        for M in inverses
-    ]
+    project, F = projector(B, csr_array(qp.A)), preconditioned(qp.P)
+    assert F is not None
+    inverses = [p and F.preconditioner(*p) for p in preconditioners]
+    n = qp.q.size
+    return [spectrum(qp.P.dot, project, n, M, tol) for M in inverses]
 
 
-def projector(F: RankOperator, G: DistributedColumns) -> Product:
+def projector(B: csr_array, G: csr_array) -> Product:
     """Return the orthogonal projector P, see the module docstring.
 
-    All ranks must call this function together.
-
-    Parameters
-    ----------
-    F : operator with rows B, which may be linearly dependent (redundant gluing)
+    B : (m, N) rows, which may be linearly dependent (redundant gluing)
     G : RᵀBᵀ (r, m) of full rank r, which may be 0
-
     """
-    within = F.onto_rows()
-    excluded = csr_array(vstack([G.part, F.average_forces().part]))
-    if not excluded.shape[0]:
-        return within
-    rows = DistributedColumns(excluded, G.ranks)
-    factor = cholesky(csc_matrix(rows.gram()))
+    gram = csr_array(B @ B.T)
+    inverse = block_pseudoinverse(decouple_contact(gram, B.shape[0]))
+    if not G.shape[0]:
+        return lambda x: gram @ (inverse @ x)
+    factor = cholesky(csc_matrix(G @ G.T))
 
     def project(x: Vector) -> Vector:
-        y = within(x)
-        return np.asarray(y - np.asarray(rows.T @ factor(rows @ y)))
+        y = gram @ (inverse @ x)
+        return np.asarray(y - G.T @ factor(G @ y))
 
     return project
 

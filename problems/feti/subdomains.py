@@ -1,12 +1,9 @@
-"""The local subdomains of one rank, and their rows of B.
+"""Torn bodies: subdomains with their copies of nodes, and the rows B that join them.
 
-Each rank assembles only its local subdomains: their meshes, stiffness matrices and
-loads, and the rows of B with entries at their nodes (the rows that *touch* them). A
-single process assembles all subdomains. Global numbers are determined by the
-subdivision (`problems.feti.subdivision`), which is replicated on all ranks. It consists
-of tables for the rows and columns of structured grids, or of a list of the nodes on
-interfaces. In addition, each rank stores a few numbers for every subdomain of every
-rank. These numbers require about as much memory as a vector of the coarse problem.
+All ranks compute the numbers of the copies, the classes of congruent subdomains and the
+rows of B. These take little time compared with the matrices of the subdomains, which
+each rank assembles for its own subdomains only
+(`problems.feti.subdomain_classes.Subdomains`).
 
 B consists of support, gluing and contact rows, in this order (Total FETI, Dostál, Horák
 and Kučera 2006). Every copy of a fixed component has a support row, unless fixed
@@ -14,7 +11,6 @@ components are eliminated. The m copies v_1 … v_m of a free component are glue
 of
 
 * ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
-* ``chain``: m − 1 rows  v_p − v_q = 0  of consecutive copies,
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
 
 Contact rows act on the average of the copies, because all copies are equal at the
@@ -30,52 +26,34 @@ may be multiplied by a factor for the shape of the cells (`problems.feti.structu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import chain, combinations
-from operator import itemgetter
+from functools import cache, cached_property
+from itertools import combinations
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array, hstack
+from scipy.sparse import bsr_array, coo_array, csr_array
 
-from mortarbench.harness import InputError, Vector
-from mortarbench.harness.distributed.vectors import Ranks, single_process
-from mortarbench.problems.fem.mesh import Nodes, dofs_of
-from mortarbench.problems.feti.distributed import balanced_partition
+from mortarbench.harness import Vector
+from mortarbench.harness.distributed.comm import SERIAL, Comm
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.balance import balanced_partition
 from mortarbench.problems.feti.subdivision import (
     Integers,
-    Points,
     Subdivision,
     SubdomainNodes,
 )
-from mortarbench.problems.feti.subdomain_classes import (
-    Clusters,
-    DecomposedBodies,
-    Dense,
-    SubdomainClass,
-    Subdomains,
-)
-from mortarbench.problems.feti.tearing import (
-    CONGRUENCE_TOL,
-    SubdomainMesh,
-    classify,
-    congruent,
-    spread_of,
-)
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass, Subdomains
+from mortarbench.problems.feti.tearing import SubdomainMesh, classify
 
 Weights = Callable[[int], NDArray[np.float64]]
 
 
 def _orthonormal(m: int) -> NDArray[np.float64]:
     return np.asarray(np.linalg.qr(np.ones((m, 1)), mode="complete")[0][:, 1:].T)
-
-
-def _chain(m: int) -> NDArray[np.float64]:
-    return np.eye(m - 1, m) - np.eye(m - 1, m, 1)
 
 
 def _redundant(m: int) -> NDArray[np.float64]:
@@ -86,7 +64,7 @@ def _redundant(m: int) -> NDArray[np.float64]:
 #: mapping from the name of the gluing to a function that returns the weights (rows, m)
 #: of m copies
 GLUE: Mapping[str, Weights] = MappingProxyType(
-    {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
+    {"orthonormal": _orthonormal, "redundant": _redundant}
 )
 
 
@@ -97,17 +75,6 @@ class Contact(NamedTuple):
     c: Vector  #: (m_I,) right-hand side
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows per tangential vector
-
-    @property
-    def groups(self) -> Nodes:
-        """First row (m_I,) of the tangential vector that contains each row.
-
-        For a contact row, this is the row itself.
-        """
-        group = np.arange(self.rows.shape[0])
-        first = group.size - self.bound.size
-        group[first:] = np.repeat(group[first :: self.tangents], self.tangents)
-        return group
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -139,7 +106,6 @@ class DecomposedProblem:
     eliminated: bool = False
     contact: Contact
     glue: str  #: name of the gluing, one of `GLUE`
-    cluster: int = 0  #: number of subdomains per side of a cluster; 0: no clusters
 
     @property
     def piece_of(self) -> Integers:
@@ -151,39 +117,6 @@ class DecomposedProblem:
     def redundant(self) -> bool:
         """True if rows of supports and gluing may be linearly dependent."""
         return self.glue == "redundant"
-
-    @cached_property
-    def clusters(self) -> NDArray[np.int64] | None:
-        """Cluster of each subdomain (S,), numbered body by body; None without clusters.
-
-        Raises
-        ------
-        InputError
-            If the subdomains of a body do not form a grid.
-
-        """
-        if not self.cluster:
-            return None
-        if (positions := self.layout.positions) is None:
-            raise InputError(
-                f"cluster={self.cluster} is not built for subdomains that do not form "
-                "a grid; expected no cluster, or bodies cut into grids of subdomains"
-            )
-        places = np.column_stack([self.layout.body, positions // self.cluster])
-        return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
-
-    def joined_pairs(self) -> tuple[Nodes, Nodes]:
-        """Return the pairs of subdomains in one cluster that share a face.
-
-        The result consists of two arrays (k,).
-        """
-        one, other, _ = self.layout.shared_node_counts()
-        clusters, positions = self.clusters, self.layout.positions
-        assert clusters is not None
-        assert positions is not None
-        apart = np.abs(positions[one] - positions[other]).sum(axis=1)
-        joined = (clusters[one] == clusters[other]) & (apart == 1)
-        return one[joined], other[joined]
 
     @cached_property
     def contact_scale(self) -> Vector:
@@ -209,86 +142,59 @@ class DecomposedProblem:
 
 
 class Entries(NamedTuple):
-    """Entries of B in the columns of this rank, and the ranks that touch their rows."""
+    """Entries of B."""
 
-    row: NDArray[np.int64]  #: (e,) global rows
-    column: NDArray[np.int64]  #: (e,) local torn unknowns
+    row: NDArray[np.int64]  #: (e,) rows
+    column: NDArray[np.int64]  #: (e,) torn unknowns
     value: Vector  #: (e,) values of the entries
-    reached: NDArray[np.int64]  #: (k, 2) pairs of a row and a rank that touches it
 
 
 @dataclass(frozen=True, eq=False)
-class LocalSubdomains:
-    """The subdomains of one rank; most properties are evaluated on first use."""
+class TornBodies:
+    """Decomposed bodies; most properties are evaluated on first use."""
 
     problem: DecomposedProblem
-    ranks: Ranks
-    rank: NDArray[np.int64]  #: (S,) rank of each subdomain
-
-    @cached_property
-    def number(self) -> NDArray[np.int64]:
-        """Global numbers of the local subdomains, (S_p,)."""
-        return np.flatnonzero(self.rank == self.ranks.rank)
+    comm: Comm = SERIAL
 
     @cached_property
     def nodes(self) -> SubdomainNodes:
-        """Torn nodes of the local subdomains, (M_p,)."""
-        return self.problem.layout.subdomain_nodes(self.number)
+        """Torn nodes of all subdomains, (M,)."""
+        layout = self.problem.layout
+        return layout.subdomain_nodes(np.arange(layout.count))
 
-    def local_nodes(self, subdomain: Nodes, node: Nodes) -> Nodes:
-        """Return the indices (k,) in `nodes` of copies of nodes in given subdomains.
+    def torn_nodes(self, subdomain: Nodes, node: Nodes) -> Nodes:
+        """Return the indices (k,) in `nodes` of copies of nodes (k,) in subdomains."""
+        nodes, N = self.nodes, np.int64(self.problem.layout.nodes)
+        return np.searchsorted(nodes.subdomain * N + nodes.number, subdomain * N + node)
 
-        Parameters
-        ----------
-        subdomain : (k,) global numbers of local subdomains
-        node : (k,) global numbers of nodes
-
-        """
-        nodes, N = self.nodes, self.problem.layout.nodes
-        keys = nodes.subdomain * np.int64(N) + nodes.number
-        return np.searchsorted(
-            keys, np.searchsorted(self.number, subdomain) * np.int64(N) + node
-        )
-
-    @property
+    @cached_property
     def component(self) -> Nodes:
-        """Global component of each torn unknown, (N_p,)."""
-        return self._component[self.free]
-
-    @property
-    def _component(self) -> Nodes:
-        """Global component of each torn unknown, including eliminated components."""
-        return self._of_nodes(self.nodes.number)
-
-    @cached_property
-    def _distinct(self) -> tuple[Nodes, Nodes]:
-        """Global nodes on this rank, and the index of each torn node among them."""
-        return np.unique(self.nodes.number, return_inverse=True)
-
-    @property
-    def components(self) -> Nodes:
-        """Global components on this rank, ascending, (n_p,)."""
-        return self._of_nodes(self._distinct[0])
-
-    @property
-    def place(self) -> Nodes:
-        """Index of each torn unknown in `components`, (N_p,)."""
-        return self._of_nodes(self._distinct[1])[self.free]
-
-    def _of_nodes(self, node: Nodes) -> Nodes:
-        """Return the components of given nodes, node by node."""
+        """Component of each torn unknown, including eliminated components."""
         d = self.problem.components
-        return np.asarray((d * node[:, None] + np.arange(d)).ravel())
+        return np.asarray((d * self.nodes.number[:, None] + np.arange(d)).ravel())
 
     @cached_property
+    def free(self) -> slice | Nodes:
+        """Indices of the torn unknowns among all components of all torn nodes."""
+        if not self.problem.eliminated:
+            return slice(None)
+        return np.flatnonzero(~np.isin(self.component, self.problem.fixed))
+
+    @property
+    def multiplicity(self) -> NDArray[np.int64]:
+        """Number of copies of each torn unknown, (N,)."""
+        multiplicity = np.repeat(self.nodes.multiplicity, self.problem.components)
+        return np.asarray(multiplicity[self.free])
+
+    @property
     def spread(self) -> csr_array:
-        """T (N_p, n_p), which maps `components` to torn unknowns in subdomain axes.
+        """T (N, n), which maps displacements to torn unknowns in subdomain axes.
 
         Each torn node has a block Qᵀ, the transpose of the rotation of its subdomain.
         Eliminated components have no rows.
         """
-        d, place = self.problem.components, self._distinct[1]
-        M, n = place.size, d * self._distinct[0].size
+        d, place = self.problem.components, self.nodes.number
+        M, n = place.size, d * self.problem.layout.nodes
         if d == 1:
             T = csr_array((np.ones(M), place, np.arange(M + 1)), shape=(M, n))
         else:
@@ -298,60 +204,41 @@ class LocalSubdomains:
             T.eliminate_zeros()
         return csr_array(T[self.free]) if self.problem.eliminated else T
 
-    @property
-    def multiplicity(self) -> NDArray[np.int64]:
-        """Number of copies of each torn unknown on all ranks, (N_p,)."""
-        multiplicity = np.repeat(self.nodes.multiplicity, self.problem.components)
-        return np.asarray(multiplicity[self.free])
-
-    @cached_property
-    def free(self) -> slice | Nodes:
-        """Indices of the torn unknowns among all components of all torn nodes."""
-        if not self.problem.eliminated:
-            return slice(None)
-        return np.flatnonzero(~np.isin(self._component, self.problem.fixed))
-
     @cached_property
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
-        """Local subdomains in classes, and rotations from the frames of their classes.
-
-        All ranks use the same frame for a class.
-        """
+        """Subdomains in classes, and their rotations from the frames of the classes."""
         problem, of = self.problem, self.problem.layout
-        material = problem.material[self.number].tolist()
-        keys = list(zip(of.keys(self.number), material, strict=True))
-        points = of.points(self.number)
-        first, class_of, rotation = classify(keys, points)
-        representative = self._representatives(
-            [(int(self.number[s]), keys[s], points[s]) for s in first]
+        material, every = problem.material.tolist(), np.arange(of.count)
+        points = of.points(every)
+        first, class_of, rotation = classify(
+            list(zip(of.keys(every), material, strict=True)), points
         )
-        classes = []
-        for k, s in enumerate(first):
-            number, origin = representative[int(self.number[s])]
-            if number != self.number[s]:
-                members = np.flatnonzero(class_of == k)
-                rotations = congruent(
-                    np.stack([origin, *(points[s] for s in members.tolist())])
-                )[1]
-                rotation[members] = rotations[1:]
-            cells = of.cells(int(self.number[s]))
-            classes.append(
-                problem.assemble_class(
-                    SubdomainMesh(origin, cells, np.full(len(cells), material[s]))
-                )
-            )
-        return Subdomains(tuple(classes), class_of), rotation
+        of_class = [points[s] for s in first]
+
+        def template(k: int) -> SubdomainClass:
+            cells = of.cells(int(first[k]))
+            of_cells = np.full(len(cells), material[first[k]])
+            return problem.assemble_class(SubdomainMesh(of_class[k], cells, of_cells))
+
+        sizes = problem.components * np.array([len(at) for at in of_class])
+        rank = self.comm.bcast(subdomain_ranks(problem, self.comm.size))
+        domains = Subdomains(
+            template=cache(template),
+            sizes=sizes,
+            class_of=class_of,
+            rank=rank,
+            comm=self.comm,
+        )
+        return domains, rotation
 
     @property
-    def floating(self) -> LocalSubdomains:
-        """The same problem with supports as rows of B, so that all subdomains float."""
-        if not self.problem.eliminated:
-            return self
-        return self.with_problem(replace(self.problem, eliminated=False))
+    def rotation(self) -> NDArray[np.float64]:
+        """Rotations (S, dim, dim) from the axes of each class to the global axes."""
+        return self._classified[1]
 
     @cached_property
     def domains(self) -> Subdomains:
-        """The local subdomains, without eliminated components."""
+        """The subdomains, without eliminated components."""
         domains = self._classified[0]
         if self.problem.eliminated:
             free = np.zeros(int(domains.start[-1]), dtype=bool)
@@ -359,151 +246,32 @@ class LocalSubdomains:
             domains = domains.restrict(free)
         return domains
 
-    def _representatives(
-        self, own: list[tuple[int, Hashable, Points]]
-    ) -> dict[int, tuple[int, Points]]:
-        """Return the first subdomain of each class on all ranks, with its points.
-
-        Ranks exchange the points of one subdomain per class, unless its key and
-        its spread (see `spread_of`) show that the class does not occur on other ranks.
-
-        own : number, key and points of the first local subdomain of each class
-
-        Returns
-        -------
-        map from the number of the first local subdomain of a class to the number and
-        points of the first subdomain of this class on all ranks
-
-        """
-        comm = self.ranks.comm
-        spreads = comm.allgather([(n, key, spread_of(at)) for n, key, at in own])
-        elsewhere: dict[Hashable, list[float]] = {}
-        for rank, theirs in enumerate(spreads):
-            for _, key, spread in theirs if rank != self.ranks.rank else ():
-                elsewhere.setdefault(key, []).append(spread)
-
-        def may_be_elsewhere(key: Hashable, at: Points) -> bool:
-            spread = np.array(elsewhere.get(key, []))
-            # a looser tolerance than in `classify`
-            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)
-            return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
-
-        candidates = [one for one in own if may_be_elsewhere(*one[1:])]
-        shared = sorted(
-            chain.from_iterable(comm.allgather(candidates)), key=itemgetter(0)
-        )
-        representatives = {number: (number, at) for number, _, at in own}
-        if shared:
-            first, group, _ = classify(
-                [key for _, key, _ in shared], [at for *_, at in shared]
-            )
-            for (number, *_), k in zip(shared, group, strict=True):
-                of, _, at = shared[first[k]]
-                representatives[number] = of, at
-        return representatives
+    @property
+    def floating(self) -> TornBodies:
+        """The same problem with supports as rows of B, so that all subdomains float."""
+        if not self.problem.eliminated:
+            return self
+        return self.with_problem(replace(self.problem, eliminated=False))
 
     @property
-    def rotation(self) -> NDArray[np.float64]:
-        """Rotations (S_p, dim, dim) from the axes of each class to the global axes."""
-        return self._classified[1]
-
-    @cached_property
-    def motions(self) -> NDArray[np.int64]:
-        """First rigid motion of each subdomain, followed by the total number, (S + 1,).
-
-        The subdomains of all ranks are included.
-        """
-        modes = np.array([kind.R.shape[1] for kind in self.domains.classes])
-        counts = np.zeros(self.rank.size, dtype=np.int64)
-        local = self.number, modes[self.domains.class_of]
-        for number, count in self.ranks.comm.allgather(local):
-            counts[number] = count
-        return np.concatenate([[0], np.cumsum(counts)])
-
-    @cached_property
-    def clusters(self) -> Clusters | None:
-        """The local clusters; None if the problem has no clusters."""
-        return None if self.problem.clusters is None else _local_clusters(self)
-
-    @property
-    def units(self) -> Subdomains | Clusters:
-        """Local floating units: clusters if there are any, otherwise subdomains."""
-        return self.clusters or self.domains
-
-    @property
-    def local_unit_motions(self) -> NDArray[np.int64]:
-        """Global numbers of the rigid motions of the local units."""
-        if (clusters := self.problem.clusters) is None:
-            return self.local_motions
-        # all units float and have the same number of motions
-        per_unit = self.unit_motions // (clusters.max() + 1)
-        local = np.unique(clusters[self.number])
-        return np.asarray((local[:, None] * per_unit + np.arange(per_unit)).ravel())
-
-    @property
-    def unit_motions(self) -> int:
-        """Size of the coarse problem: the number of rigid motions of all units."""
-        if (clusters := self.problem.clusters) is None:
-            return self.coarse_size
-        return (int(clusters.max()) + 1) * int(self.motions[1])
-
-    @property
-    def local_motions(self) -> NDArray[np.int64]:
-        """Global numbers of the rigid motions of the local subdomains."""
-        first, end = self.motions[self.number], self.motions[self.number + 1]
-        return np.concatenate([np.arange(*m) for m in zip(first, end, strict=True)])
-
-    @property
-    def coarse_size(self) -> int:
-        """Number of rigid motions of all subdomains."""
-        return int(self.motions[-1])
-
-    @cached_property
     def f(self) -> Vector:
-        """Local load (N_p,) in subdomain axes.
-
-        The load of a node is divided equally among its copies.
-        """
+        """Torn load (N,) in subdomain axes; copies of a node have equal shares."""
         d = self.problem.components
         multiplicity = np.repeat(self.nodes.multiplicity, d)
-        load = self.problem.load(self._component) / multiplicity
+        load = self.problem.load(self.component) / multiplicity
         if d > 1:
-            loaded = np.flatnonzero(load.reshape(-1, d).any(axis=1))
-            rotation = self.rotation[self.nodes.subdomain[loaded]]
             shared = load.reshape(-1, d)
+            loaded = np.flatnonzero(shared.any(axis=1))
+            rotation = self.rotation[self.nodes.subdomain[loaded]]
             shared[loaded] = np.einsum("mkq,mk->mq", rotation, shared[loaded])
         return np.asarray(load[self.free])
-
-    def resultants(self, unknown: Nodes, value: Vector) -> csr_array:
-        """Return the work (k, r) of k single forces on the rigid motions of all units.
-
-        unknown : (k,) torn unknowns
-        value : (k,) a force at each of these unknowns
-        """
-        domains = self.domains
-        of = np.searchsorted(domains.start, unknown, side="right") - 1
-        R = np.concatenate([kind.R.ravel() for kind in domains.classes])
-        first = np.cumsum([0, *(kind.R.size for kind in domains.classes)])
-        modes = np.diff(self.motions)[self.number[of]]
-        at = first[domains.class_of[of]] + modes * (unknown - domains.start[of])
-        ends = np.concatenate([[0], np.cumsum(modes)])
-        along = np.arange(ends[-1]) - np.repeat(ends[:-1], modes)
-        entries = R[np.repeat(at, modes) + along] * np.repeat(value, modes)
-        column = np.repeat(self.motions[self.number[of]], modes) + along
-        resultants = csr_array(
-            (entries, column, ends), shape=(unknown.size, self.coarse_size)
-        )
-        if self.clusters is None:
-            return resultants
-        N = self.clusters.motions.tocoo()
-        places = self.local_motions[N.row], self.local_unit_motions[N.col]
-        shape = self.coarse_size, self.unit_motions
-        return csr_array(resultants @ csr_array((N.data, places), shape=shape))
 
     @cached_property
     def _shape(self) -> Callable[[Nodes, Nodes, bool], Vector] | None:
         shaping = self.problem.shaping
-        return None if shaping is None else shaping(self.number)
+        return (
+            None if shaping is None else shaping(np.arange(self.problem.layout.count))
+        )
 
     def row_stiffness(self, node: Nodes, *, supports: bool) -> Vector:
         """Return the factors (k,) at torn nodes whose square roots scale rows of B.
@@ -514,7 +282,7 @@ class LocalSubdomains:
         supports : True for rows of supports, False for rows of gluing
         """
         of, E_of = self.problem.layout, self.problem.E
-        E = E_of[of.body[self.number][self.nodes.subdomain[node]]]
+        E = E_of[of.body[self.nodes.subdomain[node]]]
         if self.problem.piece is not None:
             number = self.nodes.number[node]
             last = of.multiplicity(number) - 1
@@ -526,28 +294,11 @@ class LocalSubdomains:
         return np.asarray(E * self._shape(node, self.nodes.number[node], supports))
 
     @cached_property
-    def rows(self) -> _Rows:
-        """The rows of B that touch local subdomains."""
-        return _local_rows(self)
+    def rows(self) -> Rows:
+        """The rows of B."""
+        return _rows(self)
 
-    @cached_property
-    def decomposed(self) -> DecomposedBodies:
-        """The local subdomains with their rows of B."""
-        domains, rows = self.domains, self.rows
-        return DecomposedBodies(
-            classes=domains.classes,
-            class_of=domains.class_of,
-            spread=self.spread,
-            B=rows.B,
-            c=rows.c,
-            scale=self.problem.contact_scale,
-            f=self.f,
-            equalities=rows.equalities,
-            clusters=self.clusters,
-            redundant=self.problem.redundant,
-        )
-
-    def with_bound(self, bound: Vector) -> LocalSubdomains:
+    def with_bound(self, bound: Vector) -> TornBodies:
         """Return a copy with friction bounds `bound` (k,); cached results are kept."""
         contact = self.problem.contact._replace(bound=bound)
         copy = replace(self, problem=replace(self.problem, contact=contact))
@@ -555,40 +306,33 @@ class LocalSubdomains:
         vars(copy).update({**vars(self), "problem": copy.problem})
         return copy
 
-    def with_problem(self, problem: DecomposedProblem) -> LocalSubdomains:
+    def with_problem(self, problem: DecomposedProblem) -> TornBodies:
         """Return the subdomains of a problem that has the same bodies.
 
         Load, contact and treatment of supports may differ. The classes of subdomains
         are reused because their assembly is expensive.
         """
         copy = replace(self, problem=problem)
-        same = ("number", "nodes", "_classified", "_distinct", "clusters")
+        same = ("nodes", "_classified", "component")
         vars(copy).update({k: v for k, v in vars(self).items() if k in same})
         return copy
 
 
-class _Rows(NamedTuple):
-    """The rows of B that touch subdomains of this rank."""
+class Rows(NamedTuple):
+    """The rows Bv = c, or Bv ≤ c for contact, of torn bodies."""
 
-    number: Nodes  #: (t,) global numbers, ascending
-    B: csr_array  #: (t, N_p) rows in local torn unknowns
-    #: (t,) for a row of a tangential vector, the number of the first row of this
-    #: vector; for any other row, its own number. All rows of a vector have the same
-    #: owner
-    group: Nodes
-    reach: csr_array  #: (t, ranks) nonzero where a rank touches a row of the group
-    c: Vector  #: (t,) right-hand side
-    equalities: int  #: number of equality rows on all ranks
-    total: int  #: number of rows on all ranks
+    B: csr_array  #: (m, N) rows in torn unknowns
+    c: Vector  #: (m,) right-hand side
+    equalities: int  #: number of equality rows, which come first
 
 
-def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
+def subdomain_ranks(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     """Return the rank (S,) of each subdomain, balancing work and memory.
 
     Raises
     ------
     InputError
-        If there are fewer subdomains (or clusters) than ranks.
+        If there are fewer subdomains than ranks.
 
     """
     of, d = problem.layout, problem.components
@@ -601,278 +345,123 @@ def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     node = np.unique(np.concatenate([problem.fixed, problem.contact.rows.indices]) // d)
     single = of.multiplicity(node) == 1
     touched = touched + np.bincount(of.holder(node[single]), minlength=S)
-    entries = problem.contact.rows.tocoo()
-    touches = csr_array(
-        (
-            np.ones(entries.nnz, dtype=np.int64),
-            (entries.row, of.holder(entries.col // d)),
-        ),
-        shape=(entries.shape[0], S),
-    )
-    touches.data[:] = 1
-    graph = csr_array(graph + graph.T) + csr_array(touches.T @ touches)
-    work = (d * touched) ** 2
-    return balanced_partition(csr_array(graph), work, of.sizes, ranks, problem.clusters)
-
-
-def _local_clusters(local: LocalSubdomains) -> Clusters:
-    """Return the local clusters, with averages over the faces inside them.
-
-    A face consists of all common nodes of two adjacent subdomains, including clamped
-    nodes. The modes Φ_s of subdomain s are its rigid motions, restricted to these nodes
-    and orthonormalised. After rotation to global axes by Q_s, the modes of both
-    subdomains span the same space: Q_1Φ_1 = Q_2Φ_2Tᵀ with an orthogonal matrix T. The
-    averages are therefore equal if Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0.
-    """
-    nodes, domains, d = local.nodes, local.domains, local.problem.components
-    r = domains.classes[0].R.shape[1]
-    faces = [dict[bytes, tuple[int, Dense]]() for _ in domains.classes]
-
-    def side(s: int, node: Nodes) -> tuple[int, Dense]:
-        """Return the index of a face in its class, and its modes in global axes."""
-        k = domains.class_of[s]
-        if (key := node.tobytes()) not in faces[k]:
-            modes = np.linalg.qr(domains.classes[k].R[dofs_of(node, d)])[0]
-            faces[k][key] = len(faces[k]), modes
-        number, modes = faces[k][key]
-        if d == 1:
-            return number, modes
-        turned = local.rotation[s] @ modes.reshape(node.size, d, r)
-        return number, turned.reshape(modes.shape)
-
-    ends, turns = [], []
-    pairs = np.stack(local.problem.joined_pairs(), axis=1)
-    pairs = np.searchsorted(
-        local.number, pairs[local.rank[pairs[:, 0]] == local.ranks.rank]
-    )
-    labels = np.asarray(local.problem.clusters)[local.number]
-    for pair in pairs[np.argsort(labels[pairs[:, 0]], kind="stable")].tolist():
-        a, b = (nodes.number[slice(*nodes.start[[s, s + 1]])] for s in pair)
-        places = np.intersect1d(a, b, assume_unique=True, return_indices=True)[1:]
-        (i, one), (j, other) = map(side, pair, places)
-        ends.append([pair[0], i, pair[1], j])
-        turns.append(one.T @ other)
-
-    first = np.cumsum([0, *(r * len(faces[k]) for k in domains.class_of)])
-    joined = np.array(ends, dtype=np.int64).reshape(-1, 2, 2)
-    start = first[joined[:, :, 0]] + r * joined[:, :, 1]
-    column, other_column = (one[:, None] + np.arange(r) for one in start.T)
-    row = np.arange(column.size).reshape(-1, r)
-    T = np.reshape(turns, (-1, r, r))
-    joints = csr_array(
-        (
-            np.append(np.ones(row.size), -T.ravel()),
-            (
-                np.append(row.ravel(), np.repeat(row, r, axis=1).ravel()),
-                np.append(column.ravel(), np.repeat(other_column, r, axis=0).ravel()),
-            ),
-        ),
-        shape=(row.size, first[-1]),
-    )
-    return Clusters(
-        domains=domains,
-        cluster=np.unique(labels, return_inverse=True)[1],
-        faces=tuple(
-            _columns(of_class, template.R.shape[0], d)
-            for of_class, template in zip(faces, domains.classes, strict=True)
-        ),
-        joints=joints,
+    return balanced_partition(
+        csr_array(graph + graph.T), (d * touched) ** 2, of.sizes, ranks
     )
 
 
-def _columns(faces: Mapping[bytes, tuple[int, Dense]], n: int, d: int) -> csr_array:
-    """Return the modes (n, q) of faces, whose keys are the bytes of their nodes."""
-    columns = [csr_array((n, 0))]
-    for key, (_, modes) in faces.items():
-        at = dofs_of(np.frombuffer(key, dtype=np.int64), d)
-        places = (
-            np.repeat(at, modes.shape[1]),
-            np.tile(np.arange(modes.shape[1]), at.size),
-        )
-        columns.append(csr_array((modes.ravel(), places), (n, modes.shape[1])))
-    return csr_array(hstack(columns))
-
-
-def _local_rows(local: LocalSubdomains) -> _Rows:
-    """Assemble the local rows of B, in the order of supports, gluing and contact."""
-    problem, ranks, d = local.problem, local.ranks, local.problem.components
-    entries = [_gluing_rows(local), _contact_rows(local)]
+def _rows(torn: TornBodies) -> Rows:
+    """Assemble the rows of B, in the order of supports, gluing and contact."""
+    problem, d = torn.problem, torn.problem.components
+    entries = [_gluing_rows(torn), _contact_rows(torn)]
     if not problem.eliminated:
-        entries.insert(0, _support_rows(local))
-    row, column, value = (
-        np.concatenate(p) for p in list(zip(*entries, strict=True))[:3]
-    )
-    pairs = np.concatenate([part.reached for part in entries])
-    # a row is listed if any row of its tangential vector touches this rank; the listed
-    # row itself may have no entries on this rank
-    number = np.unique(pairs[pairs[:, 1] == ranks.rank, 0])
-    place = np.searchsorted(number, row)
-    unknowns = problem.components * local.nodes.number.size
-    B = csr_array((value, (place, column)), shape=(number.size, unknowns))
-    if problem.eliminated:
-        B = csr_array(B[:, local.free])
-    pairs = pairs[np.isin(pairs[:, 0], number)]
-    reach = csr_array(
-        (
-            np.ones(len(pairs), dtype=np.int32),
-            (np.searchsorted(number, pairs[:, 0]), pairs[:, 1]),
-        ),
-        shape=(number.size, ranks.size),
-    )
-    reach.sort_indices()
-    reach.data[:] = 1
+        entries.insert(0, _support_rows(torn))
+    row, column, value = (np.concatenate(p) for p in zip(*entries, strict=True))
     contact, scale = problem.contact, problem.contact_scale
     E = _equality_count(problem)
-    touching = number >= E
-    c = np.zeros(number.size)
-    c[touching] = (scale * contact.c)[number[touching] - E]
+    shape = E + scale.size, d * torn.nodes.number.size
+    B = csr_array((value, (row, column)), shape=shape)
+    if problem.eliminated:
+        B = csr_array(B[:, torn.free])
+    c = np.append(np.zeros(E), scale * contact.c)
     if problem.lift is not None:
-        supports = number < int(problem.layout.multiplicity(problem.fixed // d).sum())
-        moved = local.spread @ problem.lift(local.components)
-        c[supports] = (B @ moved)[supports]
-    group = number.copy()
-    group[touching] = E + contact.groups[number[touching] - E]
-    return _Rows(
-        number=number,
-        B=B,
-        group=group,
-        reach=reach,
-        c=c,
-        equalities=E,
-        total=E + scale.size,
-    )
+        supports = slice(0, int(problem.layout.multiplicity(problem.fixed // d).sum()))
+        every = np.arange(d * problem.layout.nodes)
+        c[supports] = (B @ (torn.spread @ problem.lift(every)))[supports]
+    return Rows(B=B, c=c, equalities=E)
 
 
-def _support_rows(local: LocalSubdomains) -> Entries:
-    """Return the local support rows: one per copy of a fixed component, last first."""
-    problem, d = local.problem, local.problem.components
+def _support_rows(torn: TornBodies) -> Entries:
+    """Return the support rows: one per copy of a fixed component, last first."""
+    problem, d = torn.problem, torn.problem.components
     node, k = np.divmod(problem.fixed, d)
-    multiplicity = problem.layout.multiplicity(node)
-    copies = _local_copies(local, node)
-    of = copies.node[copies.local]
-    row = np.cumsum(multiplicity)[of] - 1 - copies.copy[copies.local]
-    value = np.sqrt(local.row_stiffness(copies.local_node, supports=True))
-    reached = np.stack([row, np.full(row.size, local.ranks.rank)], axis=1)
-    return Entries(*_rotated(local, row, copies.local_node, k[of], value), reached)
+    of, copy, at = _copies(torn, node)
+    row = np.cumsum(problem.layout.multiplicity(node))[of] - 1 - copy
+    value = np.sqrt(torn.row_stiffness(at, supports=True))
+    return _rotated(torn, row, at, k[of], value)
 
 
-class _Copies(NamedTuple):
-    """Copies of given nodes on all ranks, in the order of the nodes."""
+def _copies(torn: TornBodies, node: Nodes) -> tuple[Nodes, Nodes, Nodes]:
+    """Return all copies (k,) of given nodes, in the order of the nodes.
 
-    node: NDArray[np.int64]  #: (k,) index in the list of nodes
-    copy: NDArray[np.int64]  #: (k,) number of the copy, from 0
-    rank: NDArray[np.int64]  #: (k,) rank of the copy
-    local: NDArray[np.int64]  #: (l,) indices of the copies on this rank
-    local_node: NDArray[np.int64]  #: (l,) local torn node of each of these copies
-
-
-def _local_copies(local: LocalSubdomains, node: Nodes) -> _Copies:
-    """Return the copies of given nodes on all ranks."""
-    of = local.problem.layout
+    The results are the indices of the nodes in the list, the numbers of the copies from
+    0, and the torn nodes.
+    """
+    of = torn.problem.layout
     multiplicity = of.multiplicity(node)
     place = np.repeat(np.arange(multiplicity.size), multiplicity)
-    copy = np.arange(place.size) - np.repeat(
-        np.cumsum(multiplicity) - multiplicity, multiplicity
-    )
-    subdomain = of.holder(node[place], copy)
-    rank = local.rank[subdomain]
-    mine = np.flatnonzero(rank == local.ranks.rank)
-    torn = local.local_nodes(subdomain[mine], node[place[mine]])
-    return _Copies(place, copy, rank, mine, torn)
+    first = np.cumsum(multiplicity) - multiplicity
+    copy = np.arange(place.size) - first[place]
+    return place, copy, torn.torn_nodes(of.holder(node[place], copy), node[place])
 
 
-def _gluing_rows(local: LocalSubdomains) -> Entries:
+def _gluing_rows(torn: TornBodies) -> Entries:
     """Return the gluing rows, ordered by multiplicity, then by node and component."""
-    problem, nodes, of = local.problem, local.nodes, local.problem.layout
+    problem, nodes, of = torn.problem, torn.nodes, torn.problem.layout
     d = problem.components
     fixed = np.sort(problem.fixed)
     fixed_multiplicity = of.multiplicity(fixed // d)
     base = 0 if problem.eliminated else int(fixed_multiplicity.sum())
     none = np.zeros(0, dtype=np.int64)
-    parts = [Entries(none, none, np.zeros(0), none.reshape(0, 2))]
+    parts = [Entries(none, none, np.zeros(0))]
     for m, nodes_with in sorted(of.nodes_by_multiplicity.items()):
         W = GLUE[problem.glue](m)
         fixed_m = fixed[fixed_multiplicity == m]
         several = np.flatnonzero(nodes.multiplicity == m)
         number = nodes.number[several]
         before = of.before(number)
-        ranks = np.stack([local.rank[of.holder(number, p)] for p in range(m)], axis=1)
+        stiffness = np.sqrt(torn.row_stiffness(several, supports=False))
         for k in range(d):
             component = d * number + k
             free = ~np.isin(component, fixed_m)
             first = d * before + k - np.searchsorted(fixed_m, component)
             for r, weights in enumerate(W):
-                rows = np.flatnonzero(free & (weights[nodes.copy[several]] != 0))
+                value = weights[nodes.copy[several]]
+                rows = np.flatnonzero(free & (value != 0))
                 row = base + first[rows] * len(W) + r
-                node = several[rows]
-                value = weights[nodes.copy[node]]
-                entries = _rotated(
-                    local,
-                    row,
-                    node,
-                    np.full(node.size, k),
-                    np.sqrt(local.row_stiffness(node, supports=False)) * value,
-                )
-                ranks_there = ranks[rows][:, weights != 0]
-                reached = np.stack(
-                    [np.repeat(row, ranks_there.shape[1]), ranks_there.ravel()], axis=1
-                )
-                parts.append(Entries(*entries, reached))
+                axis, scaled = np.full(rows.size, k), stiffness[rows] * value[rows]
+                parts.append(_rotated(torn, row, several[rows], axis, scaled))
         base += len(W) * (d * nodes_with - fixed_m.size)
     return Entries(*(np.concatenate(p) for p in zip(*parts, strict=True)))
 
 
-def _contact_rows(local: LocalSubdomains) -> Entries:
+def _contact_rows(torn: TornBodies) -> Entries:
     """Return the contact and friction rows, which act on averages of copies."""
-    problem, d = local.problem, local.problem.components
+    problem, d = torn.problem, torn.problem.components
     entries = problem.contact.rows.tocoo()
     node, k = np.divmod(entries.col.astype(np.int64), d)
-    copies = _local_copies(local, node)
-    E, group = _equality_count(problem), problem.contact.groups
-    row = E + entries.row.astype(np.int64)
-    # all rows of a disc have the same owner: a rank that one row touches stores all
-    # rows
-    pairs = np.stack([group[entries.row][copies.node], copies.rank], axis=1)
-    pairs = np.unique(pairs, axis=0)
-    members = np.bincount(group, minlength=1)[pairs[:, 0]]
-    reached = np.repeat(pairs, members, axis=0)
-    before = np.repeat(np.cumsum(members) - members, members)
-    reached[:, 0] += E + np.arange(before.size) - before
-    multiplicity = problem.layout.multiplicity(node)
-    share = problem.contact_scale[entries.row] * entries.data / multiplicity
-    of = copies.node[copies.local]
-    return Entries(
-        *_rotated(local, row[of], copies.local_node, k[of], share[of]), reached
-    )
+    of, _, at = _copies(torn, node)
+    row = _equality_count(problem) + entries.row.astype(np.int64)
+    share = problem.contact_scale[entries.row] * entries.data
+    share = share / problem.layout.multiplicity(node)
+    return _rotated(torn, row[of], at, k[of], share[of])
 
 
 def _rotated(
-    local: LocalSubdomains,
+    torn: TornBodies,
     row: NDArray[np.int64],
     node: NDArray[np.int64],
     k: NDArray[np.int64],
     value: Vector,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Vector]:
+) -> Entries:
     """Rotate entries along global axes k (j,) at torn nodes (j,) to subdomain axes.
 
-    Returns
-    -------
-    rows, columns (local torn unknowns) and values of the nonzero entries
-
+    Only nonzero entries are returned.
     """
-    d = local.problem.components
+    d = torn.problem.components
     if d == 1:
-        return row, node, value
+        return Entries(row, node, value)
     # row k of Q, because u_k = Σ Q_kq v_q
-    rotation = local.rotation[local.nodes.subdomain[node], k]
+    rotation = torn.rotation[torn.nodes.subdomain[node], k]
     nonzero = rotation != 0
     column = d * node[:, None] + np.arange(d)
     rows = np.broadcast_to(row[:, None], nonzero.shape)
-    return rows[nonzero], column[nonzero], (rotation * value[:, None])[nonzero]
+    scaled = rotation * value[:, None]
+    return Entries(rows[nonzero], column[nonzero], scaled[nonzero])
 
 
 def _equality_count(problem: DecomposedProblem) -> int:
-    """Return the number of rows of supports and gluing on all ranks."""
+    """Return the number of rows of supports and gluing."""
     of, d = problem.layout, problem.components
     multiplicity = of.multiplicity(problem.fixed // d)
     glued = sum(
@@ -880,9 +469,3 @@ def _equality_count(problem: DecomposedProblem) -> int:
         for m, count in of.nodes_by_multiplicity.items()
     )
     return glued if problem.eliminated else int(multiplicity.sum()) + glued
-
-
-def on_one_process(problem: DecomposedProblem) -> LocalSubdomains:
-    """Return all subdomains as the local subdomains of a single process."""
-    every = np.zeros(problem.layout.count, dtype=np.int64)
-    return LocalSubdomains(problem, single_process(), every)

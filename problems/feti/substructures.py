@@ -11,48 +11,51 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from mortarbench.harness import Vector
+from mortarbench.harness.distributed.comm import Lead
 from mortarbench.harness.verify.products import projected_products
-from mortarbench.problems.feti.subdomain_classes import DecomposedBodies, SubdomainClass
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass
+from mortarbench.problems.feti.subdomains import TornBodies
 
 
 @dataclass(frozen=True, eq=False)
 class LocalProblems:
-    """Local problems of decomposed bodies; see `harness.mechanics.Substructures`.
+    """Local problems of torn bodies; see `harness.mechanics.Substructures`.
 
-    Stiffness matrices are factorised on first use.
+    Stiffness matrices are factorised on first use. On several ranks, all ranks must
+    call each method together, and the results are valid on rank 0
+    (`LocalProblemsOnRanks`).
     """
 
-    torn: DecomposedBodies
-    #: number of components per node; torn unknowns are numbered node by node
-    components: int = 2
+    torn: TornBodies
 
-    @property
+    @cached_property
     def spread(self) -> csr_array:
-        """T (N, n), which maps the components of local nodes to torn unknowns."""
+        """T (N, n), which maps displacements to torn unknowns."""
         return self.torn.spread
 
-    @property
+    @cached_property
     def kernel(self) -> csr_array:
         """R (N, r), a basis of the rigid motions of all subdomains."""
-        return self.torn.domains.kernel
+        return self.torn.domains.kernel()
 
     @cached_property
     def weight(self) -> Vector:
         """Sum of the diagonal entries of K at the node of each torn unknown, (N,)."""
-        d, weight = self.components, np.empty(self.spread.shape[0])
-        for template, place in self._classes():
+        d, domains = self.torn.problem.components, self.torn.domains
+        weight = np.zeros(domains.start[-1])
+        for template, place in domains.places():
             trace = template.K.diagonal().reshape(-1, d).sum(axis=1)
             weight[place] = np.repeat(trace, d)[:, None]
-        return weight
+        return domains.combined(weight)
 
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
         """Return the diagonal entries of TᵀKT for the columns `at` (k,) of T."""
-        d = self.components
+        d, domains = self.torn.problem.components, self.torn.domains
         nodes = np.unique(csr_array(self.spread[:, at]).nonzero()[0] // d)
         number = np.full(self.spread.shape[0] // d, -1)
         number[nodes] = np.arange(nodes.size)
-        blocks = np.empty((nodes.size, d, d))
-        for template, place in self._classes():
+        blocks = np.zeros((nodes.size, d, d))  # nodes of other ranks contribute zero
+        for template, place in domains.places():
             places = number[place[::d] // d]
             node, subdomain = np.nonzero(places >= 0)
             blocks[places[node, subdomain]] = _nodal(template, d)[node]
@@ -60,7 +63,7 @@ class LocalProblems:
         T = csr_array(self.spread[rows][:, at])
         ends = np.arange(nodes.size + 1)
         K = csr_array(bsr_array((blocks, ends[:-1], ends), shape=(rows.size,) * 2))
-        return np.asarray(T.multiply(K @ T).sum(axis=0))
+        return domains.comm.sum(np.asarray(T.multiply(K @ T).sum(axis=0)))
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
         """Apply PKP to v (N,) in the precision of v.
@@ -68,21 +71,21 @@ class LocalProblems:
         P is the orthogonal projector that removes rigid motions.
         """
         image, domains = np.zeros_like(v), self.torn.domains
-        for template, members in zip(domains.classes, domains.members, strict=True):
-            K, R = template.K, np.ascontiguousarray(template.R)
+        for k, members in domains.own:
+            K, R = domains.template(k).K, np.ascontiguousarray(domains.template(k).R)
             projected_products(
                 K.data, K.indices, K.indptr, R, domains.start[members], v, image
             )
-        return image
+        return domains.combined(image)
 
     def squared_product(self, v: Vector) -> Vector:
         """Apply K∘K, the squares of the entries of K, to v (N,)."""
-        image = np.empty_like(v)
-        for template, place in self._classes():
+        image = np.zeros_like(v)
+        for template, place in self.torn.domains.places():
             K = template.K.copy()
             K.data = K.data**2
             image[place] = K @ v[place]
-        return image
+        return self.torn.domains.combined(image)
 
     def solve(self, b: Vector) -> Vector:
         """Apply PK⁺P, with P of `product`, to b (N,).
@@ -91,21 +94,58 @@ class LocalProblems:
         with one column of the right-hand side for each of these subdomains.
         """
         solution, domains = np.zeros_like(b), self.torn.domains
-        acting = np.logical_or.reduceat(b != 0, domains.start[:-1])
-        for (template, place), members in zip(
-            self._classes(), domains.members, strict=True
-        ):
-            place = place[:, acting[members]]  # the solution is zero where b = 0
+        for template, place in domains.places():
+            place = place[:, b[place].any(axis=0)]  # the solution is zero where b = 0
             columns, R = b[place], template.R
             columns -= R @ (R.T @ columns)
             image = template.inverse(columns)
             image -= R @ (R.T @ image)
             solution[place] = image
-        return solution
+        return domains.combined(solution)
 
-    def _classes(self) -> zip[tuple[SubdomainClass, NDArray[np.int64]]]:
-        """Return each class with the torn unknowns (n_k, S_k) of its subdomains."""
-        return zip(self.torn.classes, self.torn.domains.places(), strict=True)
+
+@dataclass(frozen=True, eq=False)
+class LocalProblemsOnRanks:
+    """Local problems on rank 0; each method is a call of all ranks.
+
+    lead : calls methods of an object on all ranks whose attribute `parts` is a
+        `LocalProblems`
+    """
+
+    lead: Lead
+    parts: LocalProblems
+
+    @property
+    def spread(self) -> csr_array:
+        """T (N, n), which maps displacements to torn unknowns."""
+        return self.parts.spread
+
+    @cached_property
+    def kernel(self) -> csr_array:
+        """R (N, r), a basis of the rigid motions of all subdomains."""
+        kernel: csr_array = self.lead("domains.kernel")
+        return kernel
+
+    @cached_property
+    def weight(self) -> Vector:
+        """Sum of the diagonal entries of K at the node of each torn unknown, (N,)."""
+        return np.asarray(self.lead("weights"))
+
+    def diagonal(self, at: NDArray[np.int64]) -> Vector:
+        """Return the diagonal entries of TᵀKT for the columns `at` (k,) of T."""
+        return np.asarray(self.lead("parts.diagonal", at))
+
+    def product(self, v: NDArray[Any]) -> NDArray[Any]:
+        """Apply PKP to v (N,) in the precision of v."""
+        return np.asarray(self.lead("parts.product", v))
+
+    def squared_product(self, v: Vector) -> Vector:
+        """Apply K∘K, the squares of the entries of K, to v (N,)."""
+        return np.asarray(self.lead("parts.squared_product", v))
+
+    def solve(self, b: Vector) -> Vector:
+        """Apply PK⁺P to b (N,)."""
+        return np.asarray(self.lead("parts.solve", b))
 
 
 def _nodal(template: SubdomainClass, d: int) -> NDArray[np.float64]:

@@ -16,20 +16,32 @@ cells.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 
-from mortarbench.harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
+from mortarbench.harness import (
+    QP,
+    Case,
+    CaseOnRanks,
+    Grid,
+    Mechanics,
+    Solution,
+    Value,
+    Vector,
+)
+from mortarbench.harness.distributed.comm import SERIAL, Comm, Lead
+from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.sides import active
-from mortarbench.problems.duality.dualisation import primal_form
+from mortarbench.problems.duality.dualisation import Transformed, primal_form
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
+    digest_of,
     feti_dual,
     feti_matrices,
 )
@@ -44,14 +56,14 @@ from mortarbench.problems.fem.mesh import (
     joined_sides,
     rectangle_grid,
 )
-from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
+from mortarbench.problems.feti.mechanics import torn_mechanics
+from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
-    on_one_process,
+    TornBodies,
 )
 from mortarbench.problems.feti.tearing import SubdomainMesh
 
@@ -64,28 +76,47 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     """Return the case in the form `form`."""
     p: Any = params
     pair = Membranes(p["S"], p["n"])
-    matrices: Mapping[str, Any] = {}
-    decomposition: Mapping[str, Any] = {}
-    seconds, certify_by_subdomains = None, None
     if form == "primal":
-        new = primal_form(pair.qp)
-    else:
-        start = perf_counter()
-        own = on_one_process(pair.in_subdomains(p["glue"], p["cluster"]))
-        pieces, certify_by_subdomains = own.decomposed, certifier(own, pair.qp.P)
-        new = feti_dual(pieces, pair.qp)
-        seconds = perf_counter() - start
-        matrices = feti_matrices(pieces, new.qp)
-        decomposition = decomposition_quantities(pieces, new.qp)
-    dofs = pair.qp.q.size
+        return _case(pair, primal_form(pair.qp))
+    start = perf_counter()
+    served = Served(TornBodies(pair.in_subdomains(p["glue"])))
+    case = _decomposed(pair, served, Lead(SERIAL, served))
+    return replace(case, dualise_seconds=perf_counter() - start)
+
+
+def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
+    """Build the dual on several ranks; `params` must contain all keys."""
+    p: Any = params
+    pair = Membranes(p["S"], p["n"])
+    served = Served(TornBodies(pair.in_subdomains(p["glue"]), comm))
+    return CaseOnRanks(
+        served, digest_of(served.torn), partial(_decomposed, pair, served)
+    )
+
+
+def _decomposed(pair: Membranes, served: Served, lead: Lead) -> Case:
+    """Return the case of the dual of decomposed membranes on rank 0."""
+    new = feti_dual(served, pair.qp, lead=lead)
+    case = _case(pair, new, torn_mechanics(served, lead, pair.qp.P))
+    sizes = decomposition_quantities(served, new.qp)
+    return replace(
+        case,
+        quantities=lambda s: {**case.quantities(s), **sizes},
+        matrices=feti_matrices(served, new.qp) if served.torn.comm.size == 1 else {},
+    )
+
+
+def _case(
+    pair: Membranes,
+    new: Transformed,
+    subdomains: Callable[[], DecomposedMechanics] | None = None,
+) -> Case:
     return Case(
         qp=new.qp,
         recover=lambda s: new.recover(s).x,
-        quantities=lambda s: {**pair.quantities(new.recover(s)), **decomposition},
+        quantities=lambda s: pair.quantities(new.recover(s)),
         scale=new.sign,
         constant=new.constant,
-        matrices=matrices,
-        dualise_seconds=seconds,
         mechanics=Mechanics(
             primal=pair.qp,
             to_primal=new.recover,
@@ -93,8 +124,13 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
             mesh_size=1 / pair.side,
             rigid=pair.rigid,
             names=NAMES,
-            grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
-            certify_by_subdomains=certify_by_subdomains,
+            grid=Grid(
+                pair.mesh.points,
+                pair.mesh.cells,
+                pair.body,
+                np.zeros(pair.qp.q.size),
+            ),
+            subdomains=subdomains,
         ),
     )
 
@@ -160,11 +196,10 @@ class Membranes:
         along = hat_integrals(self.side, 0.0, 1.0)
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
-    def in_subdomains(self, rows: str, cluster: int = 0) -> DecomposedProblem:
+    def in_subdomains(self, rows: str) -> DecomposedProblem:
         """Return the decomposed problem of both membranes.
 
         rows : type of the rows that join copies of a node, the value of the key `glue`
-        cluster : number of subdomains per side of a cluster; 0 for no clusters
         """
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
@@ -178,7 +213,6 @@ class Membranes:
             names=NAMES,
             load=self.load,
             glue=rows,
-            cluster=cluster,
             fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
         )
@@ -199,39 +233,18 @@ class Membranes:
 
         Energy and force are divided by the tension.
         """
-        return self._quantities(s.z, self.qp.objective(s.x), float(s.x.min()))
-
-    def results(self, answer: LocalSolution) -> dict[str, Any]:
-        """Return the values of `quantities`, reduced over all ranks (collective)."""
-        lowest = answer.bodies.ranks.extreme(float(answer.u.min()), np.min)
-        return self._quantities(answer.z, answer.energy, lowest)
-
-    def _quantities(self, z: Vector, energy: float, lowest: float) -> dict[str, Any]:
         nodes = 2 * (self.side + 1) ** 2
         return {
             "nodes": nodes,
             "elements": 2 * self.side**2,
             "dofs": nodes,
             "equality_rows": self.side + 1,
-            "contact_rows": z.size,
-            "active": int(active(z).sum()),
-            "energy": energy,
-            "contact_force": float(z.sum()),
-            "lowest": lowest,
+            "contact_rows": s.z.size,
+            "active": int(active(s.z).sum()),
+            "energy": self.qp.objective(s.x),
+            "contact_force": float(s.z.sum()),
+            "lowest": float(s.x.min()),
         }
-
-
-def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
-    """Return the decomposed problem for `params`, which must contain all keys."""
-    p: Any = params
-    return Membranes(p["S"], p["n"]).in_subdomains(p["glue"], p["cluster"])
-
-
-def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
-    """Return the function that evaluates `Membranes.quantities` on ranks."""
-    del dual
-    p: Any = params
-    return Membranes(p["S"], p["n"]).results
 
 
 def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:

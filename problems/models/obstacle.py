@@ -26,7 +26,7 @@ energy are of second order. Lengths are in m, and forces are divided by the tens
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
@@ -40,6 +40,7 @@ from scipy.sparse import csc_array, csr_array, eye_array
 from mortarbench.harness import (
     QP,
     Case,
+    CaseOnRanks,
     Grid,
     InputError,
     Mechanics,
@@ -48,9 +49,15 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
+from mortarbench.harness.distributed.comm import SERIAL, Comm, Lead
+from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import Transformed, dual_bounds, dualise
-from mortarbench.problems.duality.feti_dual import decomposition_quantities, feti_dual
+from mortarbench.problems.duality.feti_dual import (
+    decomposition_quantities,
+    digest_of,
+    feti_dual,
+)
 from mortarbench.problems.fem.inverse import (
     GeneralisedInverse,
     regular_inverse,
@@ -58,14 +65,14 @@ from mortarbench.problems.fem.inverse import (
 )
 from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid
-from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
+from mortarbench.problems.feti.mechanics import torn_mechanics
+from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import mesh_in_subdomains
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
-    on_one_process,
+    TornBodies,
 )
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.membranes import membrane_class
@@ -87,42 +94,61 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
             f"feti with form {form} is not built; expected form dual, or no feti"
         )
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
-    rows, start, certify_by_subdomains = problem.qp, perf_counter(), None
-    decomposition: Mapping[str, Any] = {}
     if form == "primal":
-        new = bound_form(rows)
-    elif p["feti"]:
-        own = on_one_process(in_subdomains(params))
-        pieces, certify_by_subdomains = own.decomposed, certifier(own, rows.P)
-        new = feti_dual(pieces, rows)
-        decomposition = decomposition_quantities(pieces, new.qp)
+        return _case(p, problem, bound_form(problem.qp))
+    start = perf_counter()
+    if p["feti"]:
+        served = Served(TornBodies(in_subdomains(params)))
+        case = _decomposed(p, served, Lead(SERIAL, served))
     elif form == "dual":
-        new = dualise(rows, problem.floating())
+        case = _case(p, problem, dualise(problem.qp, problem.floating()))
     else:
-        new = dual_bounds(rows, problem.factorise())
-    seconds = None if form == "primal" else perf_counter() - start
+        case = _case(p, problem, dual_bounds(problem.qp, problem.factorise()))
+    return replace(case, dualise_seconds=perf_counter() - start)
+
+
+def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
+    """Build the dual on several ranks; `params` must contain all keys."""
+    served = Served(TornBodies(in_subdomains(params), comm))
+    return CaseOnRanks(
+        served, digest_of(served.torn), partial(_decomposed, params, served)
+    )
+
+
+def _decomposed(params: Mapping[str, Any], served: Served, lead: Lead) -> Case:
+    """Return the case of the dual in subdomains on rank 0."""
+    problem = obstacle_problem(params["dim"], params["n"], params["shape"])
+    new = feti_dual(served, problem.qp, lead=lead)
+    case = _case(params, problem, new, torn_mechanics(served, lead, problem.qp.P))
+    sizes = decomposition_quantities(served, new.qp)
+    return replace(case, quantities=lambda s: {**case.quantities(s), **sizes})
+
+
+def _case(
+    params: Mapping[str, Any],
+    problem: Problem,
+    new: Transformed,
+    subdomains: Callable[[], DecomposedMechanics] | None = None,
+) -> Case:
+    dim, n, rows = params["dim"], params["n"], problem.qp
     datum = problem.energy(np.zeros(rows.q.size))
     return Case(
         qp=new.qp,
         recover=lambda s: problem.lift + new.recover(s).x,
-        quantities=lambda s: {
-            **obstacle_quantities(problem, new.recover(s)),
-            **decomposition,
-        },
+        quantities=lambda s: obstacle_quantities(problem, new.recover(s)),
         scale=new.sign,
         constant=new.constant + datum,
-        dualise_seconds=seconds,
         mechanics=Mechanics(
             primal=rows,
             to_primal=new.recover,
             factorise=problem.factorise,
-            mesh_size=2 * HALF[p["shape"]] / p["n"],
+            mesh_size=2 * HALF[params["shape"]] / n,
             rigid=np.zeros((rows.q.size, 0)),
-            certify_by_subdomains=certify_by_subdomains,
+            subdomains=subdomains,
             constant=datum,
             grid=Grid(
                 problem.x,
-                cells(p["dim"], p["n"]),
+                cells(dim, n),
                 np.zeros(problem.cells, dtype=np.int64),
                 problem.lift,
             ),
@@ -154,7 +180,6 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
         fixed=boundary,
         contact=Contact(rows, -psi, np.zeros(0)),
         glue=p["glue"],
-        cluster=p["cluster"],
     )
 
 
@@ -176,38 +201,6 @@ def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
         fixed=csr_array(qp.A).indices,
         contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)),
         glue=p["glue"],
-        cluster=p["cluster"],
-    )
-
-
-def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
-    """Return the function that evaluates `obstacle_quantities` on ranks."""
-    del dual
-    p: Any = params
-    return partial(_rank_quantities, _grid(p["n"], p["shape"]), p["shape"])
-
-
-def _rank_quantities(
-    grid: StructuredGrid, shape: str, answer: LocalSolution
-) -> Mapping[str, Any]:
-    """Return `obstacle_quantities` from the solutions of all ranks (collective call).
-
-    The energy includes the constant qᵀw − ½wᵀKw of `Problem.energy`, with the lift w.
-    """
-    boundary = np.unique(np.concatenate([*grid.sides.values()]))
-    n = grid.divisions[0]
-    w, q = exact_height(grid.position(boundary), shape), -_load(grid, shape, boundary)
-    load = LOAD[shape] * _hat_integrals(n, 2 * HALF[shape] / n, boundary)
-    node = answer.bodies.components
-    x, at_boundary = grid.position(node), np.isin(node, boundary)
-    u = np.where(at_boundary, exact_height(x, shape), answer.u)
-    error = float(np.abs(u - exact_height(x, shape)).max())
-    return _quantities(
-        shape,
-        (2, grid.nodes, n**2, boundary.size),
-        answer.z,
-        answer.energy + float(w @ (q + load) / 2),
-        answer.bodies.ranks.extreme(error, np.max),
     )
 
 

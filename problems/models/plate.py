@@ -22,9 +22,9 @@ at its corner of largest y and z (``point``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from scipy.sparse import csr_array, eye_array
 from mortarbench.harness import (
     QP,
     Case,
+    CaseOnRanks,
     Fields,
     Grid,
     Mechanics,
@@ -42,11 +43,14 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
+from mortarbench.harness.distributed.comm import SERIAL, Comm, Lead
+from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.stepping import Forces
 from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
 from mortarbench.problems.duality.dualisation import Transformed, primal_form
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
+    digest_of,
     feti_dual,
     feti_matrices,
 )
@@ -71,20 +75,15 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
-from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
-from mortarbench.problems.feti.spectrum import (
-    Spectrum,
-    spectra_over_ranks,
-)
+from mortarbench.problems.feti.mechanics import torn_mechanics
+from mortarbench.problems.feti.served import Served
+from mortarbench.problems.feti.spectrum import Spectrum, spectra
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_subdomains
-from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
-    LocalSubdomains,
-    on_one_process,
+    TornBodies,
 )
 from mortarbench.problems.feti.tearing import blocks, grid_positions
 
@@ -103,18 +102,47 @@ PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
 
 def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
     """Return the case in the form `form`."""
+    if form == "dual":
+        served = Served(TornBodies(in_subdomains(params)))
+        return _decomposed(params, served, Lead(SERIAL, served))
     plate = model(tuple(params.items()))
+    return _case(plate, primal_form(plate.primal))
+
+
+def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
+    """Build the dual on several ranks; `params` must contain all keys."""
+    served = Served(TornBodies(in_subdomains(params), comm))
+    return CaseOnRanks(
+        served, digest_of(served.torn), partial(_decomposed, params, served)
+    )
+
+
+def _decomposed(params: Mapping[str, Value], served: Served, lead: Lead) -> Case:
+    """Return the case of the dual in subdomains on rank 0."""
+    plate = model(tuple(params.items()))
+    new = feti_dual(served, plate.primal, lead=lead)
+    case = _case(plate, new, torn_mechanics(served, lead, plate.primal.P))
+    conditions = cache(
+        lambda: dual_quantities(plate.moduli, new.qp, served.torn.rows.B)
+    )
+    sizes = decomposition_quantities(served, new.qp)
+    return replace(
+        case,
+        quantities=lambda s: {**case.quantities(s), **conditions(), **sizes},
+        matrices=feti_matrices(served, new.qp) if served.torn.comm.size == 1 else {},
+    )
+
+
+def _case(
+    plate: Plate,
+    new: Transformed,
+    subdomains: Callable[[], DecomposedMechanics] | None = None,
+) -> Case:
     mesh = plate.mesh
-    new = plate.dual if form == "dual" else primal_form(plate.primal)
-
-    def results(s: Solution) -> Mapping[str, Any]:
-        counts = quantities(plate, new.recover(s))
-        return counts | (dual_quantities(plate) if form == "dual" else {})
-
     return Case(
         qp=new.qp,
         recover=lambda s: new.recover(s).x * LENGTH,
-        quantities=results,
+        quantities=lambda s: quantities(plate, new.recover(s)),
         fields=lambda s: Fields(
             points=mesh.points,
             cells=mesh.cells,
@@ -124,7 +152,6 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         ),
         scale=new.sign * LOAD * LENGTH,
         constant=new.constant * LOAD * LENGTH,
-        matrices=feti_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
             primal=plate.primal,
             to_primal=new.recover,
@@ -139,9 +166,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
                 np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
-            certify_by_subdomains=(
-                certifier(plate.own, plate.primal.P) if form == "dual" else None
-            ),
+            subdomains=subdomains,
         ),
     )
 
@@ -158,27 +183,6 @@ class Plate:
     plane: Plane | None  #: plane state; None in 3D
     D: NDArray[np.float64]  #: (k, v, v) elasticity matrices of the materials
     primal: QP
-    parts: DecomposedProblem
-
-    @cached_property
-    def own(self) -> LocalSubdomains:
-        """All subdomains of the plate, on this process."""
-        return on_one_process(self.parts)
-
-    @property
-    def torn(self) -> DecomposedBodies:
-        """Assembled subdomains, before they are joined."""
-        return self.own.decomposed
-
-    @cached_property
-    def dual(self) -> Transformed:
-        """Dual of the decomposed plate."""
-        return feti_dual(self.torn, self.primal)
-
-    @cached_property
-    def spectra(self) -> Mapping[str, Spectrum]:
-        """Spectra of F on the kernel of the equality rows, by preconditioner name."""
-        return _spectra(self.moduli, LocalDual(self.own))
 
     @property
     def clamped(self) -> NDArray[np.int64]:
@@ -198,18 +202,6 @@ class Plate:
         """Factorise K without the prescribed components."""
         free = np.setdiff1d(np.arange(self.mesh.dofs), self.clamped)
         return regular_inverse(self.primal.P, free)
-
-
-def _spectra(moduli: Vector, dual: LocalDual) -> Mapping[str, Spectrum]:
-    """Compute the spectra named in `PRECONDITIONERS` (collective call)."""
-    qp = dual.share().qp
-    names = dict(PRECONDITIONERS)
-    uniform = moduli[0] == moduli[1]  # both scalings are then equal
-    if uniform:
-        del names["dirichlet_stiffness"]
-    per_name = spectra_over_ranks(qp.P, qp.A, list(names.values()))
-    spectra = dict(zip(names, per_name, strict=True))
-    return spectra | ({"dirichlet_stiffness": spectra["dirichlet"]} if uniform else {})
 
 
 @lru_cache(maxsize=4)
@@ -242,7 +234,6 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
         plane=_plane(p),
         D=D,
         primal=primal,
-        parts=parts,
     )
 
 
@@ -259,7 +250,6 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
         E=moduli[:1],
         names=("plate",),
         glue=p["glue"],
-        cluster=p["cluster"],
         material=_material(p),
         assemble_class=partial(elastic_class, D=D, E=moduli),
         load=force_lookup(_pull(layout, shape.sides["right"], p["load"])),
@@ -267,30 +257,6 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(shape.dim * layout.nodes), none, none),
     )
-
-
-def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
-    """Return the function that evaluates `quantities` on ranks."""
-    p: Any = params
-    elements = int(np.prod(_divisions(p)))
-    return partial(_rank_quantities, elements, _stiffness(p)[0], dual)
-
-
-def _rank_quantities(
-    elements: int, moduli: Vector, dual: LocalDual, answer: LocalSolution
-) -> dict[str, Any]:
-    """Return `quantities` and condition numbers over all ranks (collective call)."""
-    problem = answer.subdomains.problem
-    nodes, dim = problem.layout.nodes, problem.components
-    values = {
-        "nodes": nodes,
-        "elements": elements,
-        "dofs": dim * nodes,
-        "equality_rows": problem.fixed.size,
-        "energy": answer.energy * LOAD * LENGTH,
-        "tip": (answer.at(_tip(nodes, dim)) * LENGTH).tolist(),
-    }
-    return values | conditions(_spectra(moduli, dual))
 
 
 def _counts(p: Mapping[str, Any]) -> tuple[int, ...]:
@@ -403,22 +369,30 @@ def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
     }
 
 
-def dual_quantities(plate: Plate) -> dict[str, Any]:
-    """Return the decomposition, ‖PFP‖, and condition numbers with error bounds.
+def dual_quantities(moduli: Vector, qp: QP, B: csr_array) -> dict[str, Any]:
+    """Return ‖PFP‖ and condition numbers with error bounds.
 
     P is the projector onto the kernel of the equality rows. `norm_PFP` is ‖PFP‖ for
     E = 1, because all rows are scaled by √E; `kappa` is κ(PFP). `kappa_lumped` and
     `kappa_dirichlet` are κ with the preconditioner of that name and scaling by
     multiplicity, `kappa_dirichlet_stiffness` with scaling by stiffness. Keys that end
     in `_error` contain error bounds.
+
+    moduli : (2,) moduli of the materials
+    qp : dual with the rows B of supports and gluing
     """
-    return conditions(plate.spectra) | decomposition_quantities(
-        plate.torn, plate.dual.qp
-    )
+    names = dict(PRECONDITIONERS)
+    uniform = moduli[0] == moduli[1]  # both scalings are then equal
+    if uniform:
+        del names["dirichlet_stiffness"]
+    found = dict(zip(names, spectra(qp, B, list(names.values())), strict=True))
+    if uniform:
+        found["dirichlet_stiffness"] = found["dirichlet"]
+    return conditions(found)
 
 
 def conditions(spectra: Mapping[str, Spectrum]) -> dict[str, Any]:
-    """Return ‖PFP‖ and condition numbers, see `dual_quantities`."""
+    """Return the quantities of `dual_quantities` from the spectra by name."""
     values: dict[str, Any] = {
         "norm_PFP": spectra["none"].largest,
         "norm_PFP_error": spectra["none"].largest_error,
