@@ -259,9 +259,12 @@ class DualOperator:
             packed, E, comm = self.packed, self.equalities, self.domains.comm
             BW = scaled_columns(packed.B, weights)
             grams = comm.gather(csr_array(BW @ packed.BT))
-            gram = csr_array(sum(grams[1:], start=grams[0])) if grams else None
+            inverses = None
+            if grams:  # on rank 0
+                gram = csr_array(sum(grams[1:], start=grams[0]))
+                inverses = gram_inverses(gram, E)
             # (B W Bᵀ)⁺ is as sparse as B for equality rows
-            inverse, contact = comm.bcast(gram and gram_inverses(gram, E))
+            inverse, contact = comm.bcast(inverses)
             B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
             inner = Composition(
                 CompressedRows(B_D),
