@@ -20,7 +20,6 @@ SOLVERS: Registry[Solver] = Registry(
         ),
         "apgd": entry("mortarbench.solvers.baselines.apgd", "AcceleratedGradient"),
         "nsgs": entry("mortarbench.solvers.baselines.gauss_seidel", "GaussSeidel"),
-        "bvls": entry("mortarbench.solvers.baselines.bvls", "BVLS"),
         "osqp": entry("mortarbench.solvers.adapters.osqp_", "OSQP"),
         "osqp-polish": entry(
             "mortarbench.solvers.adapters.osqp_", "OSQP", polishing=True

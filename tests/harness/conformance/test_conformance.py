@@ -140,7 +140,7 @@ ONCE = ", sparse"
 #: one solver for each type of constraints that our solvers accept, one adapter of a
 #: single library, and one backend of each adapter of several libraries
 REPRESENTATIVES = {
-    "smalbe", "pdas", "feti", "nsgs", "bvls", "clarabel", "qpsolvers:quadprog",
+    "smalbe", "pdas", "feti", "nsgs", "clarabel", "qpsolvers:quadprog",
     "cvxpy:HIGHS",
 }  # fmt: skip
 #: checks of the other solvers
