@@ -18,7 +18,6 @@ SOLVERS: Registry[Solver] = Registry(
         "projected-gradient": entry(
             "mortarbench.solvers.baselines.projected_gradient", "ProjectedGradient"
         ),
-        "apgd": entry("mortarbench.solvers.baselines.apgd", "AcceleratedGradient"),
         "nsgs": entry("mortarbench.solvers.baselines.gauss_seidel", "GaussSeidel"),
         "osqp": entry("mortarbench.solvers.adapters.osqp_", "OSQP"),
         "osqp-polish": entry(

@@ -128,7 +128,7 @@ MEMBRANE = "finds where a membrane of 400 nodes touches"
 #: checks in which a solver takes seconds, mostly to reach its iteration limit
 LONG = [
     ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
-    ("projected-gradient", UNBOUNDED), ("apgd", UNBOUNDED), ("nsgs", MEMBRANE),
+    ("projected-gradient", UNBOUNDED), ("nsgs", MEMBRANE),
 ]  # fmt: skip
 #: planted solutions for all solvers: each shape once, and one shape in all storage
 #: formats
