@@ -12,7 +12,6 @@ SOLVERS: Registry[Solver] = Registry(
         "smalbe-espreso": entry("mortarbench.solvers.smalbe.solver", "ESPRESO"),
         "smalbe-paper": entry("mortarbench.solvers.smalbe.solver", "PAPER"),
         "pdas": entry("mortarbench.solvers.baselines.pdas", "PDAS"),
-        "pdas-amg": entry("mortarbench.solvers.baselines.pdas_amg", "PDASAMG"),
         "ipm-amg": entry("mortarbench.solvers.baselines.ipm_amg", "IPMAMG"),
         "feti": entry("mortarbench.solvers.baselines.feti", "FETI"),
         "projected-gradient": entry(
