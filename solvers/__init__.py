@@ -13,7 +13,6 @@ SOLVERS: Registry[Solver] = Registry(
         "smalbe-paper": entry("mortarbench.solvers.smalbe.solver", "PAPER"),
         "pdas": entry("mortarbench.solvers.baselines.pdas", "PDAS"),
         "ipm-amg": entry("mortarbench.solvers.baselines.ipm_amg", "IPMAMG"),
-        "feti": entry("mortarbench.solvers.baselines.feti", "FETI"),
         "projected-gradient": entry(
             "mortarbench.solvers.baselines.projected_gradient", "ProjectedGradient"
         ),
