@@ -44,7 +44,6 @@ from mortarbench.harness.distributed.failures import (
     run_collectively,
 )
 from mortarbench.harness.distributed.mpi import MISSING, mpiexec
-from mortarbench.harness.distributed.network import network
 from mortarbench.harness.distributed.vectors import (
     Distributable,
     DistributedQP,
@@ -210,17 +209,14 @@ def _describe_exit(status: int) -> str:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks; bind this rank to its own CPU if there are enough CPUs.
-
-    The speed of communication is measured at this point, before any solve is timed.
-    """
+    """Join the other ranks; bind this rank to its own CPU if there are enough CPUs."""
     from mpi4py import MPI  # imported here, because only runs on ranks need it
 
     cpus = fastest_first(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
     if RECORD in os.environ:
         os.set_inheritable(int(os.environ[RECORD]), False)
-    return Ranks(MPI.COMM_WORLD, network=network(MPI.COMM_WORLD))
+    return Ranks(MPI.COMM_WORLD)
 
 
 def follow(
@@ -301,9 +297,6 @@ class RankCosts(NamedTuple):
 
     seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by category of work
     counts: Mapping[str, tuple[float, float]] = {}  #: counts by operation
-    network: Mapping[
-        str, tuple[float, float]
-    ] = {}  #: speed of communication, measured at the start
 
     def fields(self) -> dict[str, Any]:
         """Return the tables as fields of a record."""
@@ -522,7 +515,7 @@ def _solve_on_ranks(
     seconds, counts = dict(ranks.seconds), dict(ranks.counts)
     solution = share.whole(s)
     peak = memory_mib("VmHWM") or 0.0
-    costs = ranks.comm.gather((seconds, counts, dict(ranks.network), peak))
+    costs = ranks.comm.gather((seconds, counts, peak))
     if solution is None or costs is None:
         return s, None
     *tables, peaks = zip(*costs, strict=True)

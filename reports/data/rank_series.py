@@ -11,23 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from mortarbench.harness import Record
 from mortarbench.harness.registry import COPIES
 from mortarbench.harness.running.pairs import paired_ratio, unpaired_ratio
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.data.size_series import by_series, sized
 from mortarbench.reports.document.formatting import clean, tolerance
-from mortarbench.reports.statistics.cost_model import (
-    Communication,
-    CostModel,
-    cost_model,
-)
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 
 PHASES = ("prepare", "solve")
@@ -50,7 +43,7 @@ class _Scaling:
     cpus: int | None  #: number of CPUs of the machine, if known
 
     def crowded(self, ranks: int) -> bool:
-        """Return whether ranks outnumber CPUs; the cost model ignores such times."""
+        """Return whether ranks outnumber CPUs, so that ranks shared CPUs."""
         return self.cpus is not None and ranks > self.cpus
 
 
@@ -89,32 +82,6 @@ class StrongSeries(_Scaling):
     def against_copies(self, ranks: int, phase: str) -> Interval | None:
         """Return speed-up of ranks / joint speed-up of copies, t(copies)/(N·t(N))."""
         return _ratio(self.copies.get(ranks), self.answers[ranks], phase, 1 / ranks)
-
-    @cached_property
-    def model(self) -> CostModel | None:
-        """Cost model of the solve; None if times or message counts are missing.
-
-        Runs with more ranks than CPUs are left out.
-        """
-        seconds, copies = (
-            {
-                n: [*times.values()]
-                for n, o in of.items()
-                if not self.crowded(n) and (times := o.seconds_by_block("solve"))
-            }
-            for of in (self.answers, self.copies)
-        )
-        if len(seconds) < 2 or 1 not in seconds:
-            return None
-        sent = map(_communication, self.answers[max(seconds)].records)
-        communication = [c for c in sent if c is not None]
-        copies = {n: of for n, of in copies.items() if n in seconds}
-        return cost_model(seconds, copies, communication) if communication else None
-
-    @property
-    def most(self) -> int | None:
-        """Number of subdomains, which limits the number of ranks; None if unknown."""
-        return self.answers[1].size("subdomains")
 
 
 class Member(NamedTuple):
@@ -270,22 +237,6 @@ def _parts(tables: Iterable[Mapping[str, Any]]) -> dict[str, Part]:
         for name in (filled[0] if filled else ())
         if all(name in t for t in filled)
     }
-
-
-def _communication(r: Record) -> Communication | None:
-    counts, network = r.rank_counts, r.rank_network
-    counted = ("reductions", "messages", "bytes")
-    timed = ("reduction_seconds", "message_seconds", "seconds_per_byte")
-    if r.ranks < 2 or not {*counted} <= {*counts} or not {*timed} <= {*network}:
-        return None
-    reductions, messages, sent = (float(counts[name][1]) for name in counted)
-    return Communication(
-        ranks=r.ranks,
-        reductions=reductions,
-        messages=messages,
-        sent=sent,
-        **{name: float(network[name][0]) for name in timed},
-    )
 
 
 def _cpus(evidence: Evidence) -> int | None:

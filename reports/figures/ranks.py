@@ -1,4 +1,4 @@
-"""Solves on several ranks: speed-up, its model, parts of the time, weak scaling."""
+"""Solves on several ranks: speed-up, parts of the time, weak scaling."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from mortarbench.reports.data.rank_series import (
 )
 from mortarbench.reports.document.figure import (
     INK,
-    Area,
     Axis,
     Figure,
     Key,
@@ -21,16 +20,13 @@ from mortarbench.reports.document.figure import (
     Mark,
     Panel,
     Row,
-    Rule,
     Segments,
     Series,
-    Text,
     categories,
     in_rows,
 )
 from mortarbench.reports.figures.style import (
     COLOURS,
-    DASHED,
     DOTTED,
     GUIDE,
     LEGEND_LINE,
@@ -42,16 +38,11 @@ from mortarbench.reports.figures.style import (
 )
 from mortarbench.reports.statistics.intervals import Interval
 
-_BAND = 0.18  #: opacity of a band
-_PALE = "#a9cde6"  #: colour of a band in the legend: the first colour with this opacity
 _LONG = 72  #: largest number of characters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
 _BEYOND = 1.5  #: largest factor by which intervals extend an axis beyond the values
 _REST = "#9aa2ad"  #: colour of the time outside the listed parts
 _ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up on one rank
-_MODEL = Look(colour=COLOURS[0], dash=DASHED, width=1.4)
-#: boundary between measured and modelled speed-ups
-_EDGE = Look(colour=INK, width=0.8, dash=DOTTED)
 
 
 def strong_figure(series: Sequence[StrongSeries]) -> Figure:
@@ -96,65 +87,6 @@ def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
         *curve((p for p in measured if not s.crowded(p[0])), _line(style), s.solver),
         *curve((p for p in measured if s.crowded(p[0])), hollow, s.solver),
     ]
-
-
-def model_figure(predicted: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
-    """Plot the speed-up predicted beyond the measured ranks.
-
-    predicted : series with a model, each with the numbers of ranks to predict
-    """
-    panels = []
-    for i, (s, asked) in enumerate(predicted):
-        assert s.model is not None
-        last = s.model.measured[-1]
-        beyond = {float(n): s.model.speed_up(n) for n in (last, *asked)}
-        ranks, modelled = tuple(beyond), beyond.values()
-        colour = look(i).colour
-        measured = [
-            (n, s.speed_up(n, "solve"), s.answers[n]) for n in s.model.measured[1:]
-        ]
-        marks: list[Mark] = [
-            _ideal([1, *asked]),
-            Area(
-                x=ranks,
-                low=tuple(v.low for v in modelled),
-                high=tuple(v.high for v in modelled),
-                colour=colour,
-                opacity=_BAND,
-                solver=s.solver,
-            ),
-            Series(
-                x=ranks,
-                y=tuple(v.value for v in modelled),
-                solver=s.solver,
-                look=replace(_MODEL, colour=colour),
-            ),
-            *curve([(1, _ONE, s.answers[1]), *measured], _line(look(i)), s.solver),
-        ]
-        panels.append(
-            Panel(
-                x=_ranks_axis([1, *s.model.measured[1:], *asked]),
-                y=_times_axis("speed-up of the solve", marks),
-                title=legible(s.case, 44),
-                marks=tuple(marks),
-                rules=(Rule(axis="x", at=float(last), look=_EDGE),),
-                texts=(
-                    Text(
-                        text="model, not measured",
-                        place=(0.97, 0.06),
-                        inside=(True, True),
-                        align=("right", "center"),
-                    ),
-                ),
-            )
-        )
-    keys = (
-        Key(label="measured", look=_line(look(0))),
-        Key(label="model, not measured", look=_MODEL),
-        Key(label="scatter of the repeats", look=_bar(_PALE)),
-        Key(label="ideal speed-up", look=GUIDE),
-    )
-    return _figure(panels, keys, 4)
 
 
 def parts_figure(series: Sequence[tuple[StrongSeries, int]]) -> Figure:
@@ -261,7 +193,6 @@ def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
     ends = [
         v for m in curves if m.intervals for v in (*m.intervals.low, *m.intervals.high)
     ]
-    ends += [v for m in marks if isinstance(m, Area) for v in (*m.low, *m.high)]
     shown += [min(max(v, least), most) for v in ends]
     low, high = min([0.9, *shown]), max([2.0, *shown])
     ticks = [2.0**k for k in range(-6, 13) if low <= 2.0**k <= 1.1 * high]

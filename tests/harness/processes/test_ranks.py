@@ -521,15 +521,3 @@ def busy_rank(mark):
         and b"worker" in command
         and resident_mib(pid) > WITH_A_SHARE
     ]
-
-
-def test_records_contain_the_speed_of_communication(answers):
-    first, alone = answers
-    network = first.record.rank_network
-    assert network.keys() == {
-        "reduction_seconds", "message_seconds", "seconds_per_byte",
-    }  # fmt: skip
-    for mean, largest in network.values():
-        assert 0 <= mean <= largest < 1
-    assert network["reduction_seconds"][0] > 0
-    assert alone.record.rank_network == {}
