@@ -184,8 +184,7 @@ class Record(Measurement):
     #: None
     accuracy: float | None = None
     #: "" for an ordinary solver; "null" for the second copy of a solver in an A/A
-    #: comparison, which measures the noise; "copies" for `ranks` independent
-    #: simultaneous solves
+    #: comparison, which measures the noise
     role: str = ""
     #: primal residual; `primal`, `dual`, `complementarity` and `gap` are defined in
     #: `harness.verify.kkt`

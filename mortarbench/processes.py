@@ -52,7 +52,6 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         registries.operators,
         ranks,
         emit,
-        copies=request.get("copies", False),
     )
     return 0
 

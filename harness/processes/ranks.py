@@ -10,10 +10,6 @@ are ended.
 A solver that supports ranks declares `on_ranks = True`. Its `prepare` is called on
 every rank with that rank's share of the QP (`harness.distributed.vectors.Share`), and
 the ranks return slices of one solution.
-
-As a baseline, the ranks can also solve copies: each rank solves the entire QP
-independently, at the same time as the other ranks. The slowest rank determines the
-measured time.
 """
 
 from __future__ import annotations
@@ -252,7 +248,7 @@ def follow(
             elif "qp" in order:
                 qp, _ = load_qp(Path(order["qp"]), operators=operators)
                 limit(order["memory_limit"])
-                share = _share(qp, ranks, copies=order["copies"])
+                share = _share(qp, ranks)
                 run = solver.prepare(share.qp, order["tol"])
                 ranks.comm.Barrier()
             elif "evaluate" in order and emitted and solution:
@@ -292,7 +288,7 @@ def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
 class RankCosts(NamedTuple):
     """Costs of a solve on several ranks, each a pair (mean, largest) over the ranks.
 
-    The tables are empty for a solve in a single process and for copies.
+    The tables are empty for a solve in a single process.
     """
 
     seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by category of work
@@ -306,8 +302,7 @@ class RankCosts(NamedTuple):
 class ParallelSolver:
     """Solver on rank 0 that sends orders to the other ranks.
 
-    The ranks jointly solve one QP, and each rank has a share of the QP. If `copies` is
-    True, each rank instead solves a copy of the entire QP.
+    The ranks jointly solve one QP, and each rank has a share of the QP.
 
     Attributes
     ----------
@@ -315,16 +310,13 @@ class ParallelSolver:
 
     """
 
-    def __init__(
-        self, solver: Solver, ranks: Ranks, emit: Emit, *, copies: bool = False
-    ) -> None:
+    def __init__(self, solver: Solver, ranks: Ranks, emit: Emit) -> None:
         # messages of failures use `__wrapped__` to find the file of the wrapped solver
         self._solver = self.__wrapped__ = solver
         self._ranks = ranks
         self._emit = emit
         self._emitted: DistributedQP | None = None
         self._emission_error: Exception | None = None
-        self._copies = copies
         self._path = Path()
         self._memory_limit: float | None = None
         self.spent = RankCosts()
@@ -385,8 +377,6 @@ class ParallelSolver:
 
     def declines(self, qp: QP) -> str | None:
         """Return the reason why the ranks cannot solve the QP, or None if they can."""
-        if self._copies:
-            return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
         # if the emission failed with another error, `prepare` raises it
@@ -418,10 +408,9 @@ class ParallelSolver:
                 "qp": str(self._path),
                 "tol": tol,
                 "memory_limit": self._memory_limit,
-                "copies": self._copies,
             }
             self._order(order)
-            share = _share(qp, self._ranks, copies=self._copies)
+            share = _share(qp, self._ranks)
         run = self._solver.prepare(share.qp, tol)
         self._ranks.comm.Barrier()
 
@@ -429,8 +418,7 @@ class ParallelSolver:
             self._order({})
             self._local_solution, result = _solve_on_ranks(run, share, self._ranks)
             assert result is not None  # on rank 0
-            solution, spent = result
-            self.spent = RankCosts() if self._copies else spent
+            solution, self.spent = result
             return solution
 
         return solve
@@ -490,9 +478,7 @@ def qp_of_sizes(variables: int, equality_rows: int) -> QP:
     )
 
 
-def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
-    if copies:
-        return Share(qp, lambda solution: solution if ranks.rank == 0 else None)
+def _share(qp: QP, ranks: Ranks) -> Share:
     product = qp.P.build()
     assert isinstance(product, Distributable)
     return product.share(qp, ranks)

@@ -82,16 +82,12 @@ def serve(
     operators: Mapping[str, Maker] = NO_MAKERS,
     ranks: Ranks | None = None,
     emit: Emit | None = None,
-    *,
-    copies: bool = False,
 ) -> None:
     """Answer requests until the pipe of requests is closed.
 
     operators : makers of operators P by name, see `harness.operators`
     ranks : communicator of the ranks that solve together; None in a single process
     emit : assembles the local share of a case on each rank
-    copies : True if each rank solves the entire QP independently, at the same time as
-        the other ranks
     """
     bench = _SolverHost(solver, operators)
     if ranks is None or emit is None:
@@ -103,7 +99,7 @@ def serve(
         bench.warm_up()
         follow(solver, ranks, operators, emit, _limit_memory)
         return
-    bench.parallel = ParallelSolver(solver, ranks, emit, copies=copies)
+    bench.parallel = ParallelSolver(solver, ranks, emit)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
     bench.parallel.end()
 

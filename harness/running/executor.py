@@ -21,7 +21,6 @@ from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
-from mortarbench.harness.registry import COPIES
 from mortarbench.harness.results.work_unit import (
     BuildFailure,
     Commands,
@@ -212,7 +211,7 @@ class Executor:
 
     def _source(self, record: Record) -> Source:
         """Return the origin of a record's QP; query the case worker once per case."""
-        if record.ranks == 1 or record.role == COPIES or record.mode != "cold":
+        if record.ranks == 1 or record.mode != "cold":
             return Source.FILE
         if record.case not in self._shared:
             request = {"shared": _case(record)}

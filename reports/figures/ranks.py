@@ -12,7 +12,6 @@ from mortarbench.reports.data.rank_series import (
     rank_parts,
 )
 from mortarbench.reports.document.figure import (
-    INK,
     Axis,
     Figure,
     Key,
@@ -27,7 +26,6 @@ from mortarbench.reports.document.figure import (
 )
 from mortarbench.reports.figures.style import (
     COLOURS,
-    DOTTED,
     GUIDE,
     LEGEND_LINE,
     curve,
@@ -46,7 +44,7 @@ _ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up on one rank
 
 
 def strong_figure(series: Sequence[StrongSeries]) -> Figure:
-    """Plot speed-ups of runs and of copies against the number of ranks, by phase."""
+    """Plot speed-ups against the number of ranks, by phase."""
     shown = sorted({n for s in series for n in s.answers})
     panels, keys = [], []
     for phase in PHASES:
@@ -64,8 +62,6 @@ def strong_figure(series: Sequence[StrongSeries]) -> Figure:
     for i, s in enumerate(series):
         label = legible(s.title, _LONG)
         keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
-    if any(s.copies for s in series):
-        keys.append(Key(label="simultaneous copies", look=_copies_look(INK)))
     if any(s.crowded(n) for s in series for n in s.several):
         crowded = replace(look(0), dash=None, fill="none")
         keys.append(Key(label="more ranks than CPUs (CPUs shared)", look=crowded))
@@ -76,14 +72,8 @@ def strong_figure(series: Sequence[StrongSeries]) -> Figure:
 def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
     first = (1, _ONE, s.answers[1])
     measured = [first, *((n, s.speed_up(n, phase), s.answers[n]) for n in s.several)]
-    copied = [
-        (n, reach, s.copies[n])
-        for n in s.several
-        if (reach := s.reach(n, phase)) is not None
-    ]
     hollow = replace(style, dash=None, fill="none")
     return [
-        *curve([first, *copied] * bool(copied), _copies_look(style.colour), s.solver),
         *curve((p for p in measured if not s.crowded(p[0])), _line(style), s.solver),
         *curve((p for p in measured if s.crowded(p[0])), hollow, s.solver),
     ]
@@ -132,14 +122,8 @@ def weak_figure(series: Sequence[WeakSeries]) -> Figure:
         marks: list[Mark] = []
         for i, s in enumerate(series):
             answers = {m.ranks: m.answer for m in s.members}
-            copied = {1: answers[1]} | {
-                n: s.copies[n] for n in answers if n in s.copies
-            }
-            drawn = {_copies_look(look(i).colour): copied, _line(look(i)): answers}
-            for style, of in drawn.items():
-                if len(of) > 1:
-                    timed = ((n, o.seconds(phase), o) for n, o in of.items())
-                    marks += curve(timed, style, s.solver)
+            timed = ((n, o.seconds(phase), o) for n, o in answers.items())
+            marks += curve(timed, _line(look(i)), s.solver)
         panels.append(
             Panel(
                 x=_ranks_axis(shown),
@@ -156,13 +140,6 @@ def weak_figure(series: Sequence[WeakSeries]) -> Figure:
         )
         for i, s in enumerate(series)
     ]
-    if any(s.copies for s in series):
-        keys.append(
-            Key(
-                label="simultaneous copies of the smallest problem",
-                look=_copies_look(INK),
-            )
-        )
     return _figure(panels, keys, 1)
 
 
@@ -207,10 +184,6 @@ def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
 
 def _line(style: Look) -> Look:
     return replace(style, dash=())
-
-
-def _copies_look(colour: str) -> Look:
-    return Look(colour=colour, marker="o", dash=DOTTED, fill="none", width=0.9)
 
 
 def _bar(colour: str) -> Look:

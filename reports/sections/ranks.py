@@ -54,11 +54,10 @@ def ranks(a: Analysis) -> Iterator[layout.Part]:
     strong, weak = strong_series(a.evidence), weak_series(a.evidence)
     if not strong and not weak:
         return
-    uncopied = any(s.several and not s.copies for s in strong)
     crowded = any(s.crowded(n) for s in strong for n in s.several) or any(
         s.crowded(m.ranks) for s in weak for m in s.members
     )
-    yield from TEXT.parts("prose", strong, weak, uncopied, crowded)
+    yield from TEXT.parts("prose", strong, weak, crowded)
     solves = [(s, n, s.answers[n]) for s in strong for n in s.answers]
     if strong:
         yield _strong_table(solves, "prepare")
@@ -92,15 +91,12 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
         time = Cell.time(o.seconds(phase), title=source(o), kind=kind)
         shown = (*_series(s), _ranks(n, kind), iterations_cell(o), time)
         if n == 1:
-            return (*shown, _ONE, _ONE, Cell(), Cell())
-        copies = [s.copies[n]] if n in s.copies else []
+            return (*shown, _ONE, _ONE)
         alone = s.answers[1]
         return (
             *shown,
             _ratio(s.speed_up(n, phase), source(alone, o), kind),
             _ratio(s.efficiency(n, phase), source(alone, o), kind),
-            _ratio(s.reach(n, phase), source(alone, *copies), kind),
-            _ratio(s.against_copies(n, phase), source(o, *copies), kind),
         )
 
     return Table(
@@ -112,8 +108,6 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
             "time",
             "speed-up",
             "efficiency",
-            "copies",
-            "of copies",
         ),
         rows=tuple(row(*each) for each in solves),
         text_columns=2,
@@ -132,16 +126,15 @@ def _weak_table(series: WeakSeries) -> Table:
         for phase in PHASES:
             yield Cell.time(o.seconds(phase), title=source(o), kind=kind)
             if m.ranks == 1:
-                yield from (_ONE, Cell())
+                yield _ONE
             else:
                 yield _ratio(series.efficiency(m, phase), runs, kind)
-                yield _ratio(series.against_copies(m, phase), source(o), kind)
 
     return Table(
         caption=f"Weak scaling: {series.title}.",
         columns=(
             "ranks", "dofs", "dofs of a rank", "iterations", "prepare", "efficiency",
-            "of copies", "solve", "efficiency", "of copies",
+            "solve", "efficiency",
         ),
         rows=tuple(tuple(row(m)) for m in series.members),
         text_columns=0,

@@ -28,18 +28,13 @@ def solve_seconds(dofs: int, ranks: int) -> float:
     return slow * (WORK * dofs / ranks + ALIKE)
 
 
-def copies_seconds(dofs: int) -> float:
-    """Return the time of simultaneous solves, one per rank, s."""
-    return SLOWDOWN * (WORK * dofs + ALIKE)
-
-
 def rank_records(
     sizes: Sequence[int] = (50_000, 100_000, 200_000),
     ranks: Sequence[int] = (1, 2, 4),
     repeats: int = 3,
     scatter: float = 0.0,
 ) -> Iterator[Record]:
-    """Yield the records of one solver on ranks and in copies, for cases of these sizes.
+    """Yield the records of one solver on ranks, for cases of these sizes.
 
     scatter : standard deviation of the logarithms of times
     """
@@ -53,21 +48,15 @@ def rank_records(
                 times = preparation, solve_seconds(dofs, n)
                 label = f"smalbe ranks={n}" if n > 1 else "smalbe"
                 noisy = np.array(times) * random.lognormal(0, scatter, 2)
-                yield _record(dofs, n, repeat, label, "", noisy)
-                if n > 1:
-                    copied = SLOWDOWN * PREPARED * dofs, copies_seconds(dofs)
-                    noisy = np.array(copied) * random.lognormal(0, scatter, 2)
-                    yield _record(
-                        dofs, n, repeat, f"smalbe copies={n}", "copies", noisy
-                    )
+                yield _record(dofs, n, repeat, label, noisy)
 
 
-def _record(dofs, n, repeat, label, role, times):
+def _record(dofs, n, repeat, label, times):
     prepare, solve = map(float, times)
-    on_ranks = n > 1 and not role
+    on_ranks = n > 1
     counts = {"reductions": REDUCTIONS, "messages": MESSAGES, "bytes": BYTES}
     return Record(
-        run_id=f"{dofs:06d}{n:02d}{len(role):01d}{repeat:02d}abc",
+        run_id=f"{dofs:06d}{n:02d}{repeat:02d}abcd",
         case=f"membranes/S={dofs // 1000}/dual", family="membranes",
         params={"S": dofs // 1000}, form="dual", solver=label, options={}, tol=1e-6,
         repeat=repeat, block=repeat, session="one", verdict=Verdict.VERIFIED,
@@ -78,7 +67,7 @@ def _record(dofs, n, repeat, label, role, times):
         if on_ranks else {},
         prepare_seconds=prepare, solve_seconds=solve, total_seconds=prepare + solve,
         peak_mib=100.0 * n, primal=1e-8, dual=1e-8, complementarity=1e-8, gap=1e-8,
-        objective=-1.0, threads=1, cpu=0, ranks=n, role=role,
+        objective=-1.0, threads=1, cpu=0, ranks=n,
         rank_seconds={name: (part * solve, 1.1 * part * solve)
                       for name, part in SPENT.items()} if on_ranks else {},
         rank_counts={name: (c, c) for name, c in counts.items()} if on_ranks else {},

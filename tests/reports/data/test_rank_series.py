@@ -13,7 +13,6 @@ from mortarbench.reports.data.rank_series import (
     strong_series,
     weak_series,
 )
-from mortarbench.reports.data.size_series import size_series
 from mortarbench.reports.folder import compose
 from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.ranks import ranks
@@ -21,7 +20,6 @@ from tests.support.manufactured_ranks import (
     BYTES,
     SLOWDOWN,
     SPENT,
-    copies_seconds,
     rank_records,
     solve_seconds,
 )
@@ -53,15 +51,6 @@ def test_speed_up_is_the_ratio_of_times_on_one_and_several_ranks(strong, n):
     assert strong.speed_up(n, "solve").value == pytest.approx(true)
     assert strong.efficiency(n, "solve").value == pytest.approx(true / n)
     assert strong.speed_up(n, "prepare").value == pytest.approx(n / SLOWDOWN)
-
-
-@pytest.mark.parametrize("n", [2, 4])
-def test_copies_show_the_slowdown_of_simultaneous_solves(strong, n):
-    assert strong.reach(n, "solve").value == pytest.approx(n / SLOWDOWN)
-    true = copies_seconds(DOFS) / (n * solve_seconds(DOFS, n))
-    assert strong.against_copies(n, "solve").value == pytest.approx(true)
-    # ranks share all work of the preparation and are as slow as copies
-    assert strong.against_copies(n, "prepare").value == pytest.approx(1.0)
 
 
 def test_intervals_of_scattered_times_contain_the_true_speed_up(strong):
@@ -96,8 +85,6 @@ def test_weak_scaling_is_recognised_by_equal_dofs_per_rank(manufactured):
     last = found[50_000].members[-1]
     true = solve_seconds(50_000, 1) / solve_seconds(200_000, 4)
     assert found[50_000].efficiency(last, "solve").value == pytest.approx(true)
-    of = found[50_000].against_copies(last, "solve")
-    assert of.value == pytest.approx(copies_seconds(50_000) / solve_seconds(200_000, 4))
 
 
 def test_cases_of_other_sizes_are_not_weak_scaling():
@@ -122,11 +109,6 @@ def test_parts_are_medians_of_means_and_of_the_largest(strong):
     assert rank_memory(strong.answers[2]) == (90.0, 99.0)
     assert rank_parts(strong.answers[1]) == {}
     assert rank_memory(strong.answers[1]) is None
-
-
-def test_copies_do_not_appear_in_series_of_sizes(manufactured):
-    (series,) = size_series(manufactured)
-    assert not any("copies" in solver for solver in series.solvers)
 
 
 def test_a_report_without_ranks_states_the_requirements(manufactured):
