@@ -34,11 +34,9 @@ import mortarbench as mb
 from mortarbench.case import Case
 from mortarbench.harness import QP, Verdict, verdict
 from mortarbench.harness.operators import assembled
-from mortarbench.harness.plugin import Solver
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.baselines import apgd, projected_gradient
-from mortarbench.solvers.baselines.apgd import AcceleratedGradient
+from mortarbench.solvers.baselines import projected_gradient
 from mortarbench.solvers.smalbe import driver
 from mortarbench.solvers.smalbe.compiled import Product
 
@@ -48,14 +46,7 @@ PERTURBED = np.linspace(0.97, 1.03, 10)  #: factors of the norm ‖P‖, or of t
 LARGE = (256, 512)  #: cells per side of problems in which P is an operator
 ROUNDS = 5  #: number of alternating rounds in the measurement of times
 CONIC = ("clarabel", "scs", "qoco", "cvxopt", "ecos")
-METHODS: dict[str, Solver] = {
-    **{
-        name: SOLVERS[name] for name in ("smalbe", "smalbe-paper", "projected-gradient")
-    },
-    "apgd": SOLVERS["apgd"],
-    "apgd, fixed step": AcceleratedGradient(shrink=1.0, growth=1.05),
-    "nsgs": SOLVERS["nsgs"],
-}
+METHODS = ("smalbe", "smalbe-paper", "projected-gradient", "nsgs")
 
 
 def mindlin(cells: int, nu: float, Q: float) -> Case:
@@ -74,7 +65,7 @@ def with_dense(qp: QP) -> QP:
 
 def count(name: str, qp: QP) -> int:
     """Solve a QP and verify the residuals; return the number of products or sweeps."""
-    s = METHODS[name].prepare(qp, TOL)()
+    s = SOLVERS[name].prepare(qp, TOL)()
     residuals = kkt_residuals(qp, s)
     assert verdict(s.status, residuals, TOL) is Verdict.VERIFIED, (name, residuals)
     return s.counts["sweeps" if name == "nsgs" else "P_products"]
@@ -102,7 +93,6 @@ def perturbed_norm(factor: float) -> Iterator[None]:
     with ExitStack() as stack:
         for module, function, name in (
             (driver, "by_lanczos", "norm"),
-            (apgd, "_start", "L"),
             (projected_gradient, "_start", "alpha"),
         ):
             estimate = partial(norm, name, getattr(module, function))
@@ -162,7 +152,7 @@ def time() -> None:
         F, v, solves, ratios = Product(qp.P, qp.q.size), qp.q.copy(), [], []
         for _ in range(ROUNDS):
             began = process_time()
-            s = METHODS["smalbe"].prepare(qp, TOL)()
+            s = SOLVERS["smalbe"].prepare(qp, TOL)()
             solves.append(process_time() - began)
             began = process_time()
             for _ in range(s.counts["P_products"]):

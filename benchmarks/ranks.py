@@ -1,12 +1,8 @@
-"""Speed-up of a solve on MPI ranks, compared with independent copies of the solve.
+"""Speed-up of a solve on MPI ranks.
 
     mpiexec -n 2 .venv/bin/python -m mpi4py benchmarks/ranks.py [CASE] [REPEATS]
 
-Memory bandwidth, which the CPUs of a machine share, limits the speed of products.
-Therefore even two independent copies of a job on two CPUs may not achieve twice the
-throughput of one copy. The script compares the speed-up of a solve on all ranks with
-the joint throughput of copies, one on each rank. The same QP is solved in three ways:
-`alone` on one rank, as independent `copies`, and by all `ranks` together. The rounds of
+The same QP is solved `alone` on one rank and by all `ranks` together. The rounds of
 these measurements alternate. The script prints medians with minimum and maximum, and
 the times of each rank for the phases of a solve. Measurements that other processes
 disturbed by more than `MAX_DISTURBANCE` are dropped, and the number of remaining
@@ -94,7 +90,6 @@ def main(name: str = CASE, repeats: str = "5") -> None:
     qp = mb.build(name).qp
     ways = {
         "alone": lambda: timed(qp, alone) if world.rank == 0 else {},
-        "copies": lambda: timed(qp, alone),
         "ranks": lambda: timed(qp, world),
     }
     results: dict[str, list[list[dict[str, float]]]] = {way: [] for way in ways}
@@ -121,12 +116,8 @@ def main(name: str = CASE, repeats: str = "5") -> None:
                 f"  {phase:8} {way:7} {median(times):8.3f} s"
                 f" [{min(times):.3f}, {max(times):.3f}]"
             )
-        one, copies, ranks = map(median, slowest.values())
-        speed_up, attainable = one / ranks, world.size * one / copies
-        print(
-            f"  {phase:8} speed-up {speed_up:.2f}, of {attainable:.2f} that copies "
-            f"reach: {speed_up / attainable:.2f}"
-        )
+        one, ranks = map(median, slowest.values())
+        print(f"  {phase:8} speed-up {one / ranks:.2f}")
     for part in list(results["ranks"][0][0])[2:]:
         each = "; ".join(
             f"{way} " + ", ".join(

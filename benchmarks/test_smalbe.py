@@ -27,7 +27,7 @@ PERMON = {
 }  # fmt: skip
 TOLERANCES = (1e-6, 1e-8)
 OURS = (
-    "smalbe", "smalbe-direct", "smalbe-condensed", "pdas", "projected-gradient", "bvls",
+    "smalbe", "smalbe-direct", "smalbe-condensed", "pdas", "projected-gradient",
 )  # fmt: skip
 
 

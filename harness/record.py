@@ -173,9 +173,6 @@ class Record(Measurement):
     rank_seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     #: [mean, largest] over ranks of the numbers of reductions, messages and bytes
     rank_counts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: [mean, largest] over ranks of reduction_seconds, message_seconds and
-    #: seconds_per_byte; see `harness.distributed.network`
-    rank_network: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     #: "cold" for a single case; "sequence" if results of earlier steps may be reused;
     #: "sequence, tighten=θ" for a sequence with tightening tolerances, see
     #: `Record.tighten`
@@ -187,8 +184,7 @@ class Record(Measurement):
     #: None
     accuracy: float | None = None
     #: "" for an ordinary solver; "null" for the second copy of a solver in an A/A
-    #: comparison, which measures the noise; "copies" for `ranks` independent
-    #: simultaneous solves
+    #: comparison, which measures the noise
     role: str = ""
     #: primal residual; `primal`, `dual`, `complementarity` and `gap` are defined in
     #: `harness.verify.kkt`
@@ -443,7 +439,6 @@ def _check(r: Record) -> None:
     _check_nested("reported", r.reported, MAX_LEVELS)
     _check_spent("rank_seconds", r.rank_seconds)
     _check_spent("rank_counts", r.rank_counts)
-    _check_spent("rank_network", r.rank_network)
 
 
 def _check_seconds(r: Record) -> None:

@@ -58,8 +58,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-COPIES = "copies"  #: role of a spec that `SolverSpec.copies` returns
-
 _SOLVER_PARTS = ("declines", "prepare")
 _FAMILY_PARTS = ("name", "defaults", "forms", "build")
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
@@ -82,8 +80,7 @@ class SolverSpec:
     #: options that the suite sets, by name
     options: Mapping[str, Any] = field(default_factory=dict)
     #: "" for an ordinary solver; "null" for the second copy of a solver in an A/A
-    #: comparison, which measures the noise; "copies" for `ranks` independent
-    #: simultaneous solves, which bound the speed-up of a solve on this number of ranks
+    #: comparison, which measures the noise
     role: str = ""
     ranks: int = 1  #: number of MPI processes
 
@@ -92,11 +89,6 @@ class SolverSpec:
         if ranks == 1:
             return self
         return replace(self, ranks=ranks, label=f"{self.label} ranks={ranks}")
-
-    def copies(self, count: int) -> SolverSpec:
-        """Return a spec of `count` independent copies of the solver, one per rank."""
-        label = f"{self.label} copies={count}"
-        return replace(self, ranks=count, role=COPIES, label=label)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.plugin import Family, Reference, Solver, as_family
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.registry import (
-    COPIES,
     Plugin,
     PluginFile,
     SolverSpec,
@@ -282,7 +281,7 @@ class Registries:
         if copy is not None:
             request["copy"] = str(copy)
         if spec.ranks > 1:
-            request |= {"ranks": spec.ranks, "copies": spec.role == COPIES}
+            request["ranks"] = spec.ranks
         name = "ranks" if spec.ranks > 1 else "worker"
         try:
             return [*self.start, name, json.dumps(request)]

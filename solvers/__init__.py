@@ -12,15 +12,11 @@ SOLVERS: Registry[Solver] = Registry(
         "smalbe-espreso": entry("mortarbench.solvers.smalbe.solver", "ESPRESO"),
         "smalbe-paper": entry("mortarbench.solvers.smalbe.solver", "PAPER"),
         "pdas": entry("mortarbench.solvers.baselines.pdas", "PDAS"),
-        "pdas-amg": entry("mortarbench.solvers.baselines.pdas_amg", "PDASAMG"),
         "ipm-amg": entry("mortarbench.solvers.baselines.ipm_amg", "IPMAMG"),
-        "feti": entry("mortarbench.solvers.baselines.feti", "FETI"),
         "projected-gradient": entry(
             "mortarbench.solvers.baselines.projected_gradient", "ProjectedGradient"
         ),
-        "apgd": entry("mortarbench.solvers.baselines.apgd", "AcceleratedGradient"),
         "nsgs": entry("mortarbench.solvers.baselines.gauss_seidel", "GaussSeidel"),
-        "bvls": entry("mortarbench.solvers.baselines.bvls", "BVLS"),
         "osqp": entry("mortarbench.solvers.adapters.osqp_", "OSQP"),
         "osqp-polish": entry(
             "mortarbench.solvers.adapters.osqp_", "OSQP", polishing=True

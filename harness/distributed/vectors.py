@@ -62,8 +62,6 @@ class Ranks:
     counts: dict[str, int] = field(
         default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
     )
-    #: result of `harness.distributed.network.network`; empty if it was not measured
-    network: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def private_comm(self) -> Comm:

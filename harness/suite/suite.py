@@ -33,7 +33,6 @@ DEFAULTS: Mapping[str, Any] = {
     "null_arm": None,
     "tighten": [0],
     "ranks": [1],
-    "copies": False,
     "max_cases": 100_000,
 }
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
@@ -361,20 +360,12 @@ def _on_ranks(
 ) -> tuple[SolverSpec, ...]:
     """Return specs of each solver for every number of ranks in the suite.
 
-    A solver that does not support ranks is returned for a single rank. If ``copies`` is
-    true, the result also contains n independent copies of the solver for each number of
-    ranks n > 1. Sequences on several ranks are refused, since the results that a solver
-    reuses are stored in a single process.
+    A solver that does not support ranks is returned for a single rank. Sequences on
+    several ranks are refused, since the results that a solver reuses are stored in a
+    single process.
     """
-    ranks, copies = table["ranks"], table["copies"]
-    counts = [ranks_asked(n, "ranks") for n in checked.filled_list("ranks", ranks)]
-    if not isinstance(copies, bool):
-        raise InputError(f"copies = {shown(copies)}; expected true or false")
-    if copies and counts == [1]:
-        raise InputError(
-            "copies = true needs a number of ranks above 1; expected, for instance, "
-            "ranks = [1, 2]"
-        )
+    ranks = checked.filled_list("ranks", table["ranks"])
+    counts = [ranks_asked(n, "ranks") for n in ranks]
     if len(set(counts)) < len(counts):
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
     if counts != [1] and sequences:
@@ -388,12 +379,9 @@ def _on_ranks(
             f"ranks = {shown(counts)}: no solver runs on several ranks; expected "
             "one that does, or no ranks"
         )
-    on_ranks = []
-    for spec in specs:
-        numbers = counts if able[spec.label] else [1]
-        on_ranks += [spec.on(n) for n in numbers]
-        on_ranks += [spec.copies(n) for n in numbers if copies and n > 1]
-    return tuple(on_ranks)
+    return tuple(
+        spec.on(n) for spec in specs for n in (counts if able[spec.label] else [1])
+    )
 
 
 def _spec(entry: object) -> SolverSpec:

@@ -16,7 +16,7 @@ from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Case
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
-from mortarbench.harness.registry import COPIES, SolverSpec
+from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
 from mortarbench.harness.verify.certificate import (
     Certificate,
@@ -63,8 +63,6 @@ def new_record(
         identity += [mode, accuracy]
     if spec.ranks > 1:
         identity += [{"ranks": spec.ranks}]
-    if spec.role == COPIES:
-        identity += [COPIES]
     text = json.dumps(identity, sort_keys=True)
     return Record(
         run_id=hex_digest([text.encode()]),

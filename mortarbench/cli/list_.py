@@ -38,7 +38,7 @@ answer is verified does not depend on this claim ([comparison policy](fair-play.
 | bounds and equality rows, dense, at most a few hundred unknowns | `smalbe-direct` |
 | inequality rows, such as a primal form | `piqp`, `clarabel` |
 | inequality rows, small and dense | `daqp` |
-| decomposed bodies (P is an operator) | `smalbe`; without contact `feti` |
+| decomposed bodies (P is an operator) | `smalbe` |
 | load steps and other sequences | a solver with *yes* in the column "sequences" |
 
 `mortarbench test-solver NAME` runs the conformance suite on one of these solvers, or on

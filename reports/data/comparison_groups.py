@@ -220,7 +220,7 @@ def all_groups(
 
 
 def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
-    """Select the answer of every solver to every case; omit copies and null arms."""
+    """Select the answer of every solver to every case; omit null arms."""
     cells = _cells(evidence, pool_forms=pool_forms)
     return {key: _answers(rows) for key, rows in cells.items()}
 

@@ -21,7 +21,7 @@ from mortarbench.reports.data.rank_series import base_label
 from mortarbench.reports.data.size_series import SIZES, SeriesKey, fixed_keys
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
-MULTIGRID = ("pdas-amg", "ipm-amg")  #: solvers that form a separate route
+MULTIGRID = "ipm-amg"  #: solver that forms a separate route
 #: keys that choose a decomposition; they do not change the mesh
 DECOMPOSITION = ("feti", "glue", "parts", "cluster")
 #: values of `Route.kind` in a complete map
@@ -221,7 +221,7 @@ def _route(o: Outcome) -> Route:
     layout = ", ".join(f"{k}={v}" for k, v in keys.items() if v)
     if not layout:
         kind = r.form
-        if kind == PRIMAL[0] and base_label(o) in MULTIGRID:
+        if kind == PRIMAL[0] and base_label(o) == MULTIGRID:
             kind = PRIMAL[1]
     else:
         kind = "hybrid TFETI" if keys["cluster"] else "TFETI"

@@ -3,31 +3,22 @@
 Strong scaling solves one case on an increasing number of ranks. Weak scaling enlarges
 the case in proportion to the number of ranks, so that the number of dofs per rank is
 constant up to the factor 1 ± `ALIKE`. Both are reported separately for preparation and
-solve. They are compared with copies, that is, simultaneous independent solves, one per
-rank, which share the machine's memory as ranks do.
+solve.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from mortarbench.harness import Record
-from mortarbench.harness.registry import COPIES
 from mortarbench.harness.running.pairs import paired_ratio, unpaired_ratio
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.data.size_series import by_series, sized
 from mortarbench.reports.document.formatting import clean, tolerance
-from mortarbench.reports.statistics.cost_model import (
-    Communication,
-    CostModel,
-    cost_model,
-)
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 
 PHASES = ("prepare", "solve")
@@ -46,11 +37,10 @@ class _Scaling:
     """Verified answers of one solver for several numbers of ranks."""
 
     solver: str  #: label of the solver on one rank
-    copies: Mapping[int, Outcome]  #: simultaneous solves, by number of solves
     cpus: int | None  #: number of CPUs of the machine, if known
 
     def crowded(self, ranks: int) -> bool:
-        """Return whether ranks outnumber CPUs; the cost model ignores such times."""
+        """Return whether ranks outnumber CPUs, so that ranks shared CPUs."""
         return self.cpus is not None and ranks > self.cpus
 
 
@@ -82,40 +72,6 @@ class StrongSeries(_Scaling):
         """Return the efficiency t(1)/(N·t(N))."""
         return _ratio(self.answers[1], self.answers[ranks], phase, 1 / ranks)
 
-    def reach(self, ranks: int, phase: str) -> Interval | None:
-        """Return the joint speed-up of N copies, N·t(1)/t(copies)."""
-        return _ratio(self.answers[1], self.copies.get(ranks), phase, ranks)
-
-    def against_copies(self, ranks: int, phase: str) -> Interval | None:
-        """Return speed-up of ranks / joint speed-up of copies, t(copies)/(N·t(N))."""
-        return _ratio(self.copies.get(ranks), self.answers[ranks], phase, 1 / ranks)
-
-    @cached_property
-    def model(self) -> CostModel | None:
-        """Cost model of the solve; None if times or message counts are missing.
-
-        Runs with more ranks than CPUs are left out.
-        """
-        seconds, copies = (
-            {
-                n: [*times.values()]
-                for n, o in of.items()
-                if not self.crowded(n) and (times := o.seconds_by_block("solve"))
-            }
-            for of in (self.answers, self.copies)
-        )
-        if len(seconds) < 2 or 1 not in seconds:
-            return None
-        sent = map(_communication, self.answers[max(seconds)].records)
-        communication = [c for c in sent if c is not None]
-        copies = {n: of for n, of in copies.items() if n in seconds}
-        return cost_model(seconds, copies, communication) if communication else None
-
-    @property
-    def most(self) -> int | None:
-        """Number of subdomains, which limits the number of ranks; None if unknown."""
-        return self.answers[1].size("subdomains")
-
 
 class Member(NamedTuple):
     """One case of a weak series, with its number of ranks."""
@@ -131,10 +87,7 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WeakSeries(_Scaling):
-    """Verified answers of one solver to cases with about equally many dofs per rank.
-
-    The copies are simultaneous solves of the first case.
-    """
+    """Verified answers of one solver to cases with about equally many dofs per rank."""
 
     title: str  #: family, fixed parameters, solver, tolerance
     #: members by number of ranks, ascending; the first is on one rank
@@ -144,20 +97,15 @@ class WeakSeries(_Scaling):
         """Return the efficiency t(1)/t(N) relative to the first case; ideally 1."""
         return _ratio(self.members[0].answer, member.answer, phase, paired=False)
 
-    def against_copies(self, member: Member, phase: str) -> Interval | None:
-        """Return t(copies)/t(N), with N simultaneous copies of the first case."""
-        return _ratio(self.copies.get(member.ranks), member.answer, phase, paired=False)
-
 
 def strong_series(evidence: Evidence) -> list[StrongSeries]:
     """Return a series for each case that a solver solved on one rank and on several."""
     series = []
     for (case, tol), row in evidence.outcomes.items():
-        by_role: dict[str, dict[str, dict[int, Outcome]]] = {"": {}, COPIES: {}}
+        by_ranks: dict[str, dict[int, Outcome]] = {}
         for o in row.values():
-            if o.verified and o.first.role in by_role:
-                by_ranks = by_role[o.first.role].setdefault(base_label(o), {})
-                by_ranks[o.first.ranks] = o
+            if o.verified and not o.first.role:
+                by_ranks.setdefault(base_label(o), {})[o.first.ranks] = o
         series += [
             StrongSeries(
                 case=case,
@@ -165,9 +113,8 @@ def strong_series(evidence: Evidence) -> list[StrongSeries]:
                 solver=solver,
                 cpus=_cpus(evidence),
                 answers=dict(sorted(answers.items())),
-                copies=by_role[COPIES].get(solver, {}),
             )
-            for solver, answers in by_role[""].items()
+            for solver, answers in by_ranks.items()
             if 1 in answers and len(answers) > 1
         ]
     return series
@@ -197,11 +144,6 @@ def weak_series(evidence: Evidence) -> list[WeakSeries]:
                             for ms in by_ranks.values()
                         ),
                         cpus=_cpus(evidence),
-                        copies={
-                            o.first.ranks: o
-                            for _, o in of
-                            if o.first.role == COPIES and o.case == first.answer.case
-                        },
                     )
                 )
     return series
@@ -209,14 +151,12 @@ def weak_series(evidence: Evidence) -> list[WeakSeries]:
 
 def base_label(o: Outcome) -> str:
     """Return the label that a solver has on one rank."""
-    r = o.first
-    word = "copies" if r.role == COPIES else "ranks"
-    return o.solver.replace(f" {word}={r.ranks}", "", 1) if r.ranks > 1 else o.solver
+    return o.solver.replace(f" ranks={o.first.ranks}", "", 1)
 
 
 def _ratio(
-    a: Outcome | None,
-    b: Outcome | None,
+    a: Outcome,
+    b: Outcome,
     phase: str,
     factor: float = 1.0,
     *,
@@ -226,8 +166,6 @@ def _ratio(
 
     paired : True if the times of a and b in a block were measured in succession
     """
-    if a is None or b is None:
-        return None
     of_a, of_b = a.seconds_by_block(phase), b.seconds_by_block(phase)
     if not of_a or not of_b:
         return None
@@ -270,22 +208,6 @@ def _parts(tables: Iterable[Mapping[str, Any]]) -> dict[str, Part]:
         for name in (filled[0] if filled else ())
         if all(name in t for t in filled)
     }
-
-
-def _communication(r: Record) -> Communication | None:
-    counts, network = r.rank_counts, r.rank_network
-    counted = ("reductions", "messages", "bytes")
-    timed = ("reduction_seconds", "message_seconds", "seconds_per_byte")
-    if r.ranks < 2 or not {*counted} <= {*counts} or not {*timed} <= {*network}:
-        return None
-    reductions, messages, sent = (float(counts[name][1]) for name in counted)
-    return Communication(
-        ranks=r.ranks,
-        reductions=reductions,
-        messages=messages,
-        sent=sent,
-        **{name: float(network[name][0]) for name in timed},
-    )
 
 
 def _cpus(evidence: Evidence) -> int | None:

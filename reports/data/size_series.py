@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from mortarbench.harness.registry import COPIES
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, tolerance
 from mortarbench.reports.statistics.intervals import PowerLaw, power_law
@@ -146,8 +145,7 @@ def size_series(evidence: Evidence) -> list[SizeSeries]:
     Size n is the number of dofs, and m is the number of equality and contact rows.
     """
     series = []
-    answers = [(n, o) for n, o in sized(evidence) if o.first.role != COPIES]
-    for key, of in by_series(answers).items():
+    for key, of in by_series(sized(evidence)).items():
         sizes: dict[int, dict[str, Outcome]] = {}
         for n, o in of:
             sizes.setdefault(n, {})[o.solver] = o
@@ -179,8 +177,7 @@ def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
     for o in evidence.flat:
         params = dict(o.first.params)
         value = params.pop(key, 0)
-        counts = o.verified and o.first.role != COPIES
-        if counts and isinstance(value, int) and value > 0:
+        if o.verified and isinstance(value, int) and value > 0:
             parts = o.first.case.split("/")
             case = "/".join(p for p in parts if not p.startswith(f"{key}="))
             same = (case, tuple(sorted(params.items())), o.tol, o.solver)

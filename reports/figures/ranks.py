@@ -1,4 +1,4 @@
-"""Solves on several ranks: speed-up, its model, parts of the time, weak scaling."""
+"""Solves on several ranks: speed-up, parts of the time, weak scaling."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from mortarbench.reports.data.rank_series import (
     rank_parts,
 )
 from mortarbench.reports.document.figure import (
-    INK,
-    Area,
     Axis,
     Figure,
     Key,
@@ -21,17 +19,13 @@ from mortarbench.reports.document.figure import (
     Mark,
     Panel,
     Row,
-    Rule,
     Segments,
     Series,
-    Text,
     categories,
     in_rows,
 )
 from mortarbench.reports.figures.style import (
     COLOURS,
-    DASHED,
-    DOTTED,
     GUIDE,
     LEGEND_LINE,
     curve,
@@ -42,20 +36,15 @@ from mortarbench.reports.figures.style import (
 )
 from mortarbench.reports.statistics.intervals import Interval
 
-_BAND = 0.18  #: opacity of a band
-_PALE = "#a9cde6"  #: colour of a band in the legend: the first colour with this opacity
 _LONG = 72  #: largest number of characters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
 _BEYOND = 1.5  #: largest factor by which intervals extend an axis beyond the values
 _REST = "#9aa2ad"  #: colour of the time outside the listed parts
 _ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up on one rank
-_MODEL = Look(colour=COLOURS[0], dash=DASHED, width=1.4)
-#: boundary between measured and modelled speed-ups
-_EDGE = Look(colour=INK, width=0.8, dash=DOTTED)
 
 
 def strong_figure(series: Sequence[StrongSeries]) -> Figure:
-    """Plot speed-ups of runs and of copies against the number of ranks, by phase."""
+    """Plot speed-ups against the number of ranks, by phase."""
     shown = sorted({n for s in series for n in s.answers})
     panels, keys = [], []
     for phase in PHASES:
@@ -73,8 +62,6 @@ def strong_figure(series: Sequence[StrongSeries]) -> Figure:
     for i, s in enumerate(series):
         label = legible(s.title, _LONG)
         keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
-    if any(s.copies for s in series):
-        keys.append(Key(label="simultaneous copies", look=_copies_look(INK)))
     if any(s.crowded(n) for s in series for n in s.several):
         crowded = replace(look(0), dash=None, fill="none")
         keys.append(Key(label="more ranks than CPUs (CPUs shared)", look=crowded))
@@ -85,76 +72,11 @@ def strong_figure(series: Sequence[StrongSeries]) -> Figure:
 def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
     first = (1, _ONE, s.answers[1])
     measured = [first, *((n, s.speed_up(n, phase), s.answers[n]) for n in s.several)]
-    copied = [
-        (n, reach, s.copies[n])
-        for n in s.several
-        if (reach := s.reach(n, phase)) is not None
-    ]
     hollow = replace(style, dash=None, fill="none")
     return [
-        *curve([first, *copied] * bool(copied), _copies_look(style.colour), s.solver),
         *curve((p for p in measured if not s.crowded(p[0])), _line(style), s.solver),
         *curve((p for p in measured if s.crowded(p[0])), hollow, s.solver),
     ]
-
-
-def model_figure(predicted: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
-    """Plot the speed-up predicted beyond the measured ranks.
-
-    predicted : series with a model, each with the numbers of ranks to predict
-    """
-    panels = []
-    for i, (s, asked) in enumerate(predicted):
-        assert s.model is not None
-        last = s.model.measured[-1]
-        beyond = {float(n): s.model.speed_up(n) for n in (last, *asked)}
-        ranks, modelled = tuple(beyond), beyond.values()
-        colour = look(i).colour
-        measured = [
-            (n, s.speed_up(n, "solve"), s.answers[n]) for n in s.model.measured[1:]
-        ]
-        marks: list[Mark] = [
-            _ideal([1, *asked]),
-            Area(
-                x=ranks,
-                low=tuple(v.low for v in modelled),
-                high=tuple(v.high for v in modelled),
-                colour=colour,
-                opacity=_BAND,
-                solver=s.solver,
-            ),
-            Series(
-                x=ranks,
-                y=tuple(v.value for v in modelled),
-                solver=s.solver,
-                look=replace(_MODEL, colour=colour),
-            ),
-            *curve([(1, _ONE, s.answers[1]), *measured], _line(look(i)), s.solver),
-        ]
-        panels.append(
-            Panel(
-                x=_ranks_axis([1, *s.model.measured[1:], *asked]),
-                y=_times_axis("speed-up of the solve", marks),
-                title=legible(s.case, 44),
-                marks=tuple(marks),
-                rules=(Rule(axis="x", at=float(last), look=_EDGE),),
-                texts=(
-                    Text(
-                        text="model, not measured",
-                        place=(0.97, 0.06),
-                        inside=(True, True),
-                        align=("right", "center"),
-                    ),
-                ),
-            )
-        )
-    keys = (
-        Key(label="measured", look=_line(look(0))),
-        Key(label="model, not measured", look=_MODEL),
-        Key(label="scatter of the repeats", look=_bar(_PALE)),
-        Key(label="ideal speed-up", look=GUIDE),
-    )
-    return _figure(panels, keys, 4)
 
 
 def parts_figure(series: Sequence[tuple[StrongSeries, int]]) -> Figure:
@@ -200,14 +122,8 @@ def weak_figure(series: Sequence[WeakSeries]) -> Figure:
         marks: list[Mark] = []
         for i, s in enumerate(series):
             answers = {m.ranks: m.answer for m in s.members}
-            copied = {1: answers[1]} | {
-                n: s.copies[n] for n in answers if n in s.copies
-            }
-            drawn = {_copies_look(look(i).colour): copied, _line(look(i)): answers}
-            for style, of in drawn.items():
-                if len(of) > 1:
-                    timed = ((n, o.seconds(phase), o) for n, o in of.items())
-                    marks += curve(timed, style, s.solver)
+            timed = ((n, o.seconds(phase), o) for n, o in answers.items())
+            marks += curve(timed, _line(look(i)), s.solver)
         panels.append(
             Panel(
                 x=_ranks_axis(shown),
@@ -224,13 +140,6 @@ def weak_figure(series: Sequence[WeakSeries]) -> Figure:
         )
         for i, s in enumerate(series)
     ]
-    if any(s.copies for s in series):
-        keys.append(
-            Key(
-                label="simultaneous copies of the smallest problem",
-                look=_copies_look(INK),
-            )
-        )
     return _figure(panels, keys, 1)
 
 
@@ -261,7 +170,6 @@ def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
     ends = [
         v for m in curves if m.intervals for v in (*m.intervals.low, *m.intervals.high)
     ]
-    ends += [v for m in marks if isinstance(m, Area) for v in (*m.low, *m.high)]
     shown += [min(max(v, least), most) for v in ends]
     low, high = min([0.9, *shown]), max([2.0, *shown])
     ticks = [2.0**k for k in range(-6, 13) if low <= 2.0**k <= 1.1 * high]
@@ -276,10 +184,6 @@ def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
 
 def _line(style: Look) -> Look:
     return replace(style, dash=())
-
-
-def _copies_look(colour: str) -> Look:
-    return Look(colour=colour, marker="o", dash=DOTTED, fill="none", width=0.9)
 
 
 def _bar(colour: str) -> Look:

@@ -1,9 +1,8 @@
-"""One solve on several ranks: strong and weak scaling, parts of times, cost model."""
+"""One solve on several ranks: strong and weak scaling, parts of times."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 
 from mortarbench.reports.data.cells import answer_columns, iterations_cell, source
 from mortarbench.reports.data.evidence import Outcome
@@ -26,20 +25,16 @@ from mortarbench.reports.document.formatting import TIMED, significant
 from mortarbench.reports.document.layout import Cell, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.ranks import (
-    model_figure,
     parts_figure,
     strong_figure,
     weak_figure,
 )
 from mortarbench.reports.sections import Analysis, section
-from mortarbench.reports.statistics.cost_model import CostModel
 from mortarbench.reports.statistics.intervals import Interval
 
 MOST_DRAWN = 4  #: largest number of series in a figure; all are tabulated
-MISFIT = 0.2  #: largest relative misfit of a model that is used to predict
-PREDICTED = (4, 8, 16, 32, 64, 128, 256)  #: numbers of ranks with predicted speed-ups
 _CROWDED = "more ranks than CPUs: ranks shared CPUs"
-TEXT = Sentences(__name__, ALIKE=ALIKE, MISFIT=MISFIT, MOST_DRAWN=MOST_DRAWN)
+TEXT = Sentences(__name__, ALIKE=ALIKE, MOST_DRAWN=MOST_DRAWN)
 
 #: a series, a number of ranks, and the answer on this number of ranks
 Solve = tuple[StrongSeries, int, Outcome]
@@ -59,13 +54,10 @@ def ranks(a: Analysis) -> Iterator[layout.Part]:
     strong, weak = strong_series(a.evidence), weak_series(a.evidence)
     if not strong and not weak:
         return
-    modelled = [s for s in strong if s.model is not None]
-    asked = [s for s in modelled if predicted(s)]
-    uncopied = any(s.several and not s.copies for s in strong)
     crowded = any(s.crowded(n) for s in strong for n in s.several) or any(
         s.crowded(m.ranks) for s in weak for m in s.members
     )
-    yield from TEXT.parts("prose", strong, weak, uncopied, crowded, modelled)
+    yield from TEXT.parts("prose", strong, weak, crowded)
     solves = [(s, n, s.answers[n]) for s in strong for n in s.answers]
     if strong:
         yield _strong_table(solves, "prepare")
@@ -73,8 +65,7 @@ def ranks(a: Analysis) -> Iterator[layout.Part]:
     yield from map(_weak_table, weak)
     several = [each for each in solves if each[1] in each[0].several]
     yield from _part_tables(several)
-    yield from _model_tables(modelled, asked)
-    yield from _pictures(strong, weak, asked)
+    yield from _pictures(strong, weak)
 
 
 def _ratio(interval: Interval | None, title: str, kind: str = "") -> Cell:
@@ -100,15 +91,12 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
         time = Cell.time(o.seconds(phase), title=source(o), kind=kind)
         shown = (*_series(s), _ranks(n, kind), iterations_cell(o), time)
         if n == 1:
-            return (*shown, _ONE, _ONE, Cell(), Cell())
-        copies = [s.copies[n]] if n in s.copies else []
+            return (*shown, _ONE, _ONE)
         alone = s.answers[1]
         return (
             *shown,
             _ratio(s.speed_up(n, phase), source(alone, o), kind),
             _ratio(s.efficiency(n, phase), source(alone, o), kind),
-            _ratio(s.reach(n, phase), source(alone, *copies), kind),
-            _ratio(s.against_copies(n, phase), source(o, *copies), kind),
         )
 
     return Table(
@@ -120,8 +108,6 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
             "time",
             "speed-up",
             "efficiency",
-            "copies",
-            "of copies",
         ),
         rows=tuple(row(*each) for each in solves),
         text_columns=2,
@@ -140,16 +126,15 @@ def _weak_table(series: WeakSeries) -> Table:
         for phase in PHASES:
             yield Cell.time(o.seconds(phase), title=source(o), kind=kind)
             if m.ranks == 1:
-                yield from (_ONE, Cell())
+                yield _ONE
             else:
                 yield _ratio(series.efficiency(m, phase), runs, kind)
-                yield _ratio(series.against_copies(m, phase), source(o), kind)
 
     return Table(
         caption=f"Weak scaling: {series.title}.",
         columns=(
             "ranks", "dofs", "dofs of a rank", "iterations", "prepare", "efficiency",
-            "of copies", "solve", "efficiency", "of copies",
+            "solve", "efficiency",
         ),
         rows=tuple(tuple(row(m)) for m in series.members),
         text_columns=0,
@@ -204,85 +189,14 @@ def _part(part: Part | None, o: Outcome) -> Cell:
     return Cell(text=text, value=part.mean, title=source(o))
 
 
-def _model_tables(
-    modelled: Sequence[StrongSeries], asked: Sequence[StrongSeries]
-) -> Iterator[Table]:
-    """Tabulate the terms of the cost models, and predictions of models that fit."""
-
-    def row(s: StrongSeries, m: CostModel) -> tuple[Cell, ...]:
-        runs = source(*(s.answers[n] for n in m.measured))
-        terms = (m.work, m.repeated, m.slowdown, *m.communication)
-        return (
-            *_series(s),
-            Cell(text=", ".join(map(str, m.measured)), title=runs),
-            *(Cell.number(term, significant, title=runs) for term in terms),
-            Cell.number(m.misfit, "{:.1%}".format),
-            Cell.number(m.ranks_at(0.5)),
-        )
-
-    if modelled:
-        yield Table(
-            caption=TEXT("model_caption"),
-            columns=(
-                *_SERIES,
-                "fitted to ranks",
-                "W, s",
-                "C, s",
-                "s",
-                "reductions, s",
-                "messages, s",
-                "bytes, s",
-                "misfit",
-                "efficiency ≥ 1/2 up to N =",
-            ),
-            rows=tuple(row(s, s.model) for s in modelled if s.model is not None),
-            text_columns=2,
-            notes=(TEXT("model_note"),),
-        )
-
-    def prediction(n: int, s: StrongSeries) -> Cell:
-        if s.model is None or n not in predicted(s):
-            return Cell()
-        return _ratio(s.model.speed_up(n), "predicted, not measured", "quiet")
-
-    if asked:
-        beyond = sorted({n for s in asked for n in predicted(s)})
-        yield Table.of(
-            TEXT("prediction_caption"),
-            asked,
-            (
-                *answer_columns(),
-                *((f"N = {n}", partial(prediction, n)) for n in beyond),
-            ),
-            text_columns=2,
-            notes=("The number of subdomains limits the number of ranks.",),
-        )
-
-
-def predicted(s: StrongSeries) -> tuple[int, ...]:
-    """Return the numbers of ranks, beyond the measured ones, for which to predict.
-
-    The tuple is empty if the misfit of the model exceeds `MISFIT`.
-    """
-    assert s.model is not None
-    if s.model.misfit > MISFIT:
-        return ()
-    most = s.most or PREDICTED[-1]
-    return tuple(n for n in PREDICTED if s.model.measured[-1] < n <= most)
-
-
 def _pictures(
-    strong: Sequence[StrongSeries],
-    weak: Sequence[WeakSeries],
-    asked: Sequence[StrongSeries],
+    strong: Sequence[StrongSeries], weak: Sequence[WeakSeries]
 ) -> Iterator[Picture]:
     timed = [(s, n) for s in strong for n in s.several if rank_parts(s.answers[n])]
-    shown = [(s, predicted(s)) for s in asked[:MOST_DRAWN]]
     drawn: tuple[tuple[str, Sequence[object], Callable[[], Figure]], ...] = (
         ("strong", strong, lambda: strong_figure(strong[:MOST_DRAWN])),
         ("parts", timed, lambda: parts_figure(timed[: 3 * MOST_DRAWN])),
         ("weak", weak, lambda: weak_figure(weak[:MOST_DRAWN])),
-        ("model", asked, lambda: model_figure(shown)),
     )
     for name, shown_series, draw in drawn:
         if shown_series:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import diags_array
 
 from mortarbench.harness import QP, Matrix, Vector
-from mortarbench.solvers.baselines.face import Faces, Factorise, Solve
+from mortarbench.solvers.baselines.face import Faces, Solve, factoriser
 from mortarbench.solvers.common.conversion import csc, dense
 from mortarbench.solvers.common.stopping import curvatures
 
@@ -65,7 +65,6 @@ class Problem:
     D: Vector  #: (n,) diagonal of P; a typical curvature replaces negligible entries
     rho: Vector  #: (m,) weights of the rows of A
     sigma: Vector  #: (p,) weights of the rows of G
-    factorise: Factorise
     faces: Faces
     counts: Counter[str]
 
@@ -76,9 +75,7 @@ class Problem:
         return np.asarray(force + self.qp.q + DELTA * self.D * (at.x - centre.x))
 
 
-def penalise(
-    qp: QP, counts: Counter[str], factorise: Factorise, kappa: float = KAPPA
-) -> Problem:
+def penalise(qp: QP, counts: Counter[str], kappa: float = KAPPA) -> Problem:
     """Return the problem with row weights κ/(a D⁻¹aᵀ).
 
     If P is dense and there are no inequality rows, `factoriser` also factorises the
@@ -101,8 +98,8 @@ def penalise(
     unbounded = np.isinf(qp.lb) & np.isinf(qp.ub)
     if store is dense and unbounded.any() and not qp.h.size:
         counts["factorisations"] += 1
-    faces = factorise(M, G, sigma, unbounded)
-    return Problem(qp, A, G, D, rho, sigma, factorise, faces, counts)
+    faces = factoriser(M, G, sigma, unbounded)
+    return Problem(qp, A, G, D, rho, sigma, faces, counts)
 
 
 def row_norms(M: Matrix, D: Vector) -> Vector:

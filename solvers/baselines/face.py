@@ -30,12 +30,6 @@ Solve = Callable[[Vector], Vector]
 #: mask of free components (n,), mask of active rows (p,) ↦ solution operator of the
 #: face
 Faces = Callable[[Mask, Mask], Solve]
-#: M, G, ρ, mask of components without bounds ↦ `Faces`; see `factoriser`
-Factorise = Callable[[Matrix, Matrix, Vector, Mask], Faces]
-
-
-class InnerSolveError(ArithmeticError):
-    """Error for an iterative solve on a face that does not converge."""
 
 
 def factoriser(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:

@@ -27,6 +27,11 @@ these steps:
    B for H and the components F that occur in rows of A or G, the preconditioner is
 
        z ← H_FF⁻¹ r_F,   z ← z + B(r − Hz),   z ← z + H_FF⁻¹ (r − Hz)_F.
+
+The V-cycle is smoothed aggregation of pyamg (Vaněk, Mandel and Brezina 1996, Computing
+56). In the primal QP of floating elastic bodies, the kernel of P contains the
+translations, which are its near-kernel vectors. Rotations are not used, because a QP
+contains no coordinates.
 """
 
 from __future__ import annotations
@@ -38,20 +43,29 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array, vstack
-from scipy.sparse.linalg import LinearOperator
+from scipy.sparse import (
+    bsr_array,
+    csc_array,
+    csr_array,
+    csr_matrix,
+    diags_array,
+    eye_array,
+    vstack,
+)
+from scipy.sparse.linalg import LinearOperator, cg
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
-from mortarbench.harness import QP, About, Solution, Status, Vector
-from mortarbench.solvers.baselines.active_set import row_norms
-from mortarbench.solvers.baselines.face import InnerSolveError, Mask
-from mortarbench.solvers.baselines.multigrid import (
-    cg_on_free,
-    multigrid,
-    near_kernel,
-    needs_sparse,
-    on_free,
+from mortarbench.harness import (
+    QP,
+    About,
+    Matrix,
+    Solution,
+    Status,
+    Vector,
+    needs_matrices,
 )
+from mortarbench.solvers.baselines.active_set import row_norms
+from mortarbench.solvers.baselines.face import Mask
 from mortarbench.solvers.common.conversion import check_positive
 from mortarbench.solvers.common.stopping import curvatures, relative_residual
 
@@ -72,6 +86,16 @@ TO_BOUNDARY = 0.995
 #: smallest residual or the smallest sᵀz so far; rounding or inexact solves then prevent
 #: progress.
 PATIENCE = 10
+#: a translation t counts as an element of the kernel if ‖Pt‖∞ is at most this factor
+#: times ‖P‖∞
+KERNEL_ROUNDING = 1e-8
+#: largest number of unknowns on the coarsest level
+COARSEST = 100
+MAX_CG = 1000  #: largest number of CG steps per solve; contact cases need 5 to 80
+
+
+class InnerSolveError(ArithmeticError):
+    """Error for conjugate gradients that do not converge."""
 
 
 class Point(NamedTuple):
@@ -154,7 +178,11 @@ class IPMAMG:
         check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
-        return needs_sparse(qp)
+        if (reason := needs_matrices(qp)) is not None:
+            return reason
+        if isinstance(qp.P, np.ndarray):
+            return "P is dense, but multigrid needs a sparse matrix"
+        return None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         problem = _scale(qp)
@@ -198,7 +226,7 @@ def _scale(qp: QP) -> Problem:
         lower=lower,
         fixed=fixed,
         filter=np.flatnonzero(occurs & ~fixed),
-        V_cycle=multigrid(near_kernel(P)),
+        V_cycle=_multigrid(_near_kernel(P)),
     )
 
 
@@ -288,8 +316,9 @@ def _solver(
     A, C, D, fixed, F = problem.A, problem.C, problem.D, problem.fixed, problem.filter
     H = problem.P + diags_array(DELTA * D) + KAPPA * (A.T @ A)
     H = H + C.T @ (diags_array(W) @ C)
-    free = ~fixed
-    H = on_free(H, free, D)
+    # fixed variables keep uncoupled rows, so that every node keeps its block
+    mask = diags_array(1.0 * ~fixed)
+    H = csr_array(mask @ H @ mask + diags_array(np.where(fixed, D, 0.0)))
     V_cycle = problem.V_cycle(H)
     counts["factorisations"] += 1
     if F.size:
@@ -307,4 +336,64 @@ def _solver(
     precondition = LinearOperator(H.shape, matvec=filtered, dtype=float)
     atol = CG_SHARE * tol * float(np.linalg.norm(problem.qp.q))
 
-    return cg_on_free(H, free, precondition, counts, rtol=CG_RTOL, atol=atol)
+    def count(_: object) -> None:
+        counts["cg"] += 1
+
+    def solve(r: Vector) -> Vector:
+        dx, failed = cg(
+            H,
+            np.where(fixed, 0.0, r),
+            rtol=CG_RTOL,
+            atol=atol,
+            maxiter=MAX_CG,
+            M=precondition,
+            callback=count,
+        )
+        if failed:
+            raise InnerSolveError(f"no convergence in {MAX_CG} steps of CG")
+        return np.where(fixed, 0.0, dx)
+
+    return solve
+
+
+def _near_kernel(P: Matrix) -> NDArray[np.float64]:
+    """Return translations (n, d) of nodes with d = 3 or 2 components, or ones (n, 1).
+
+    Translations are returned if they are in the kernel of P, as for floating bodies.
+    """
+    n = P.shape[0]
+    scale = KERNEL_ROUNDING * abs(P).sum(axis=1).max() if n else 0.0
+    for d in (3, 2):
+        if n and n % d == 0:
+            kernel = np.tile(np.eye(d), (n // d, 1))
+            if np.abs(P @ kernel).max() <= scale:
+                return kernel
+    return np.ones((n, 1))
+
+
+def _multigrid(kernel: NDArray[np.float64]) -> Callable[[csr_array], LinearOperator]:
+    """Return a function that sets up one V-cycle for a positive definite matrix (n, n).
+
+    kernel : near-kernel vectors (n, d); matrices are divided into blocks of d rows
+
+    Raises
+    ------
+    ImportError
+        If pyamg is not installed.
+
+    """
+    import pyamg  # imported here because it is optional and slow to import
+
+    d = kernel.shape[1]
+
+    def V_cycle(M: csr_array) -> LinearOperator:
+        levels = pyamg.smoothed_aggregation_solver(
+            csr_matrix(M) if d == 1 else bsr_array(M, blocksize=(d, d)),
+            B=kernel,
+            symmetry="symmetric",
+            max_coarse=COARSEST,
+            coarse_solver="splu",  # the default pseudo-inverse took seconds
+        )
+        return levels.aspreconditioner()
+
+    return V_cycle

@@ -56,7 +56,6 @@ from mortarbench.solvers.baselines.active_set import (
     penalise,
     solve_subproblem,
 )
-from mortarbench.solvers.baselines.face import Factorise, InnerSolveError, factoriser
 from mortarbench.solvers.baselines.infeasibility_certificate import (
     proves_infeasible,
     proves_unbounded,
@@ -126,11 +125,6 @@ class PDAS:
         run = self._set_up(qp, tol, None)
         return lambda: run()[0]
 
-    def faces(self, qp: QP, tol: float, counts: Counter[str]) -> Factorise:
-        """Return the function that sets up the factorisation of faces."""
-        del qp, tol, counts
-        return factoriser
-
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         """Return the `prepare` function of a sequence with warm starts.
 
@@ -159,7 +153,7 @@ class PDAS:
         broken = Solution.without_point(qp, Status.FAILED, message)
         try:
             counts = Counter[str]()
-            problem = penalise(qp, counts, self.faces(qp, tol, counts))
+            problem = penalise(qp, counts)
         except NOT_POSITIVE:
             return lambda: (broken, None)
 
@@ -168,8 +162,6 @@ class PDAS:
                 return _proximal(problem, tol, _start(qp, carry), self.max_iter)
             except NOT_POSITIVE:
                 return broken, None
-            except InnerSolveError as e:
-                return Solution.without_point(qp, Status.FAILED, f"{e}"), None
 
         return run
 
@@ -220,7 +212,7 @@ def _proximal(
         stalled = 0 if worst < best / 2 else stalled + 1
         if stalled and stalled % 2 == 0 and kappa < MAX_KAPPA:
             kappa, solve = RHO_GROWTH * kappa, None
-            problem = penalise(qp, counts, problem.factorise, kappa)
+            problem = penalise(qp, counts, kappa)
         centre, best, slack = run.at, min(best, worst), slack / 10
     rounding = "no further progress because of rounding"
     message = rounding if run.settled else "step limit"

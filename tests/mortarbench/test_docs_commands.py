@@ -116,7 +116,7 @@ ELSEWHERE = {
     "mortarbench run suites/demo.toml --dask tcp://HOST:8786": "test_cluster.py",
     "mortarbench run fleet --dask tcp://login1:8786": "test_cluster.py",
     "mortarbench run demo --dask local": "test_cluster.py",
-    "mortarbench run ranks": "test_ranks.py, a smaller suite of ranks and copies",
+    "mortarbench run ranks": "test_ranks.py, a smaller suite of ranks",
     "mortarbench run fleet --dask tls://login1:8786": "test_cluster_tls.py",
     "python cluster.py": "it submits jobs to a batch system",
     "mortarbench run fleet --out out/fleet --dask tcp://login1:PORT": "the same",

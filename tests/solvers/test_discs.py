@@ -14,7 +14,7 @@ from tests.support.discs import mindlin, natural_map, qp_on_cones, qp_on_discs
 from tests.support.slow_seeds import seeds
 
 SMALBES = ["smalbe", "smalbe-paper", "smalbe-espreso"]
-ON_CONES = ["projected-gradient", "apgd", "nsgs"]
+ON_CONES = ["projected-gradient", "nsgs"]
 ON_DISCS = [*ON_CONES, *SMALBES]
 TOL = 1e-9
 
@@ -178,10 +178,6 @@ PRODUCTS = {
         0.3: {88: 31, 376: 45, 820: 62, 1468: 74},
         0.9: {88: 24, 376: 38, 820: 47, 1468: 70},
     },
-    "apgd": {  # with a fixed step
-        0.3: {88: 61, 376: 98, 820: 145, 1468: 188},
-        0.9: {88: 61, 376: 98, 820: 145, 1468: 188},
-    },
     "smalbe": {
         0.3: {88: 29, 376: 50, 820: 65, 1468: 78},
         0.9: {88: 29, 376: 39, 820: 47, 1468: 53},
@@ -193,7 +189,7 @@ PRODUCTS = {
 }
 #: number of products for the norm, the start and the claimed residuals, which the
 #: prototypes do not count
-OF_CLAIM = {"projected-gradient": 3, "apgd": 3, "smalbe": 3, "smalbe-paper": 14}
+OF_CLAIM = {"projected-gradient": 3, "smalbe": 3, "smalbe-paper": 14}
 
 
 @pytest.mark.parametrize("name", PRODUCTS)

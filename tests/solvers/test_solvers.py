@@ -43,7 +43,7 @@ CONCRETE = {name: s for name, s in SOLVERS.items() if "*" not in name} | {
 }
 WILDCARDS = ("qpsolvers:*", "cvxpy:*")
 #: active-set methods, whose accuracy does not depend on the tolerance
-EXACT = ("bvls", "daqp", "highs", "quadprog", "smalbe-direct")
+EXACT = ("daqp", "highs", "quadprog", "smalbe-direct")
 SPARSE = (
     "osqp", "clarabel", "proxqp", "piqp", "highs-hipo", "scs", "qpalm", "qoco", "qtqp",
     "cvxopt",

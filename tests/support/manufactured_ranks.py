@@ -1,4 +1,4 @@
-"""Records of solves on ranks with times from a cost model.
+"""Records of solves on ranks with manufactured times.
 
     python -m tests.support.manufactured_ranks DIR [SCATTER]
 
@@ -17,34 +17,15 @@ from mortarbench.harness import Record, Verdict
 WORK, ALIKE = 4e-6, 0.02  #: shared work per dof, and repeated work of each rank, s
 SLOWDOWN = 1.25  #: factor by which simultaneous ranks slow each other down
 REDUCTIONS, MESSAGES, BYTES = 300, 100, 2e6
-REDUCTION, MESSAGE, BYTE = 5e-6, 3e-6, 5e-10  #: unit costs, s
 PREPARED = 2e-6  #: time of preparation per dof, s; ranks share it completely
 #: fractions of the solve time by part
 SPENT = {"products": 0.5, "exchange": 0.05, "coarse": 0.15, "waiting": 0.2}
 
 
-def sent_seconds(ranks: int) -> float:
-    """Return the time of communication in a solve, s.
-
-    Reductions use a tree of ranks, and each rank has at most six neighbours.
-    """
-    if ranks == 1:
-        return 0.0
-    tree, neighbours = int(np.ceil(np.log2(ranks))), min(ranks - 1, 6)
-    return (
-        tree * REDUCTIONS * REDUCTION + neighbours * MESSAGES * MESSAGE + BYTES * BYTE
-    )
-
-
 def solve_seconds(dofs: int, ranks: int) -> float:
     """Return the time of a solve on `ranks` ranks, s."""
     slow = SLOWDOWN if ranks > 1 else 1.0
-    return slow * (WORK * dofs / ranks + ALIKE) + sent_seconds(ranks)
-
-
-def copies_seconds(dofs: int) -> float:
-    """Return the time of simultaneous solves, one per rank, s."""
-    return SLOWDOWN * (WORK * dofs + ALIKE)
+    return slow * (WORK * dofs / ranks + ALIKE)
 
 
 def rank_records(
@@ -53,7 +34,7 @@ def rank_records(
     repeats: int = 3,
     scatter: float = 0.0,
 ) -> Iterator[Record]:
-    """Yield the records of one solver on ranks and in copies, for cases of these sizes.
+    """Yield the records of one solver on ranks, for cases of these sizes.
 
     scatter : standard deviation of the logarithms of times
     """
@@ -67,25 +48,15 @@ def rank_records(
                 times = preparation, solve_seconds(dofs, n)
                 label = f"smalbe ranks={n}" if n > 1 else "smalbe"
                 noisy = np.array(times) * random.lognormal(0, scatter, 2)
-                yield _record(dofs, n, repeat, label, "", noisy)
-                if n > 1:
-                    copied = SLOWDOWN * PREPARED * dofs, copies_seconds(dofs)
-                    noisy = np.array(copied) * random.lognormal(0, scatter, 2)
-                    yield _record(
-                        dofs, n, repeat, f"smalbe copies={n}", "copies", noisy
-                    )
+                yield _record(dofs, n, repeat, label, noisy)
 
 
-def _record(dofs, n, repeat, label, role, times):
+def _record(dofs, n, repeat, label, times):
     prepare, solve = map(float, times)
-    on_ranks = n > 1 and not role
-    tree, neighbours = int(np.ceil(np.log2(n))), min(n - 1, 6)
-    counts = {"reductions": REDUCTIONS, "messages": MESSAGES * neighbours,
-              "bytes": BYTES}  # fmt: skip
-    network = {"reduction_seconds": REDUCTION * tree, "message_seconds": MESSAGE,
-               "seconds_per_byte": BYTE}  # fmt: skip
+    on_ranks = n > 1
+    counts = {"reductions": REDUCTIONS, "messages": MESSAGES, "bytes": BYTES}
     return Record(
-        run_id=f"{dofs:06d}{n:02d}{len(role):01d}{repeat:02d}abc",
+        run_id=f"{dofs:06d}{n:02d}{repeat:02d}abcd",
         case=f"membranes/S={dofs // 1000}/dual", family="membranes",
         params={"S": dofs // 1000}, form="dual", solver=label, options={}, tol=1e-6,
         repeat=repeat, block=repeat, session="one", verdict=Verdict.VERIFIED,
@@ -96,11 +67,10 @@ def _record(dofs, n, repeat, label, role, times):
         if on_ranks else {},
         prepare_seconds=prepare, solve_seconds=solve, total_seconds=prepare + solve,
         peak_mib=100.0 * n, primal=1e-8, dual=1e-8, complementarity=1e-8, gap=1e-8,
-        objective=-1.0, threads=1, cpu=0, ranks=n, role=role,
+        objective=-1.0, threads=1, cpu=0, ranks=n,
         rank_seconds={name: (part * solve, 1.1 * part * solve)
                       for name, part in SPENT.items()} if on_ranks else {},
         rank_counts={name: (c, c) for name, c in counts.items()} if on_ranks else {},
-        rank_network={name: (c, c) for name, c in network.items()} if on_ranks else {},
         quantities={"dofs": dofs, "equality_rows": 10, "contact_rows": 10,
                     "subdomains": 64},
         environment="8c2f9a56e00f",

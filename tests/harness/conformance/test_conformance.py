@@ -99,9 +99,7 @@ CONCRETE = NATIVE | configured(BACKENDS)
 #: checks of conformance, without equivalent formulations, which have a separate test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
 #: solvers for which the default tests include all equivalent formulations
-REWRITTEN = {"smalbe", "pdas", "feti", "clarabel"}
-#: solver that accepts only equations, and therefore declines these QPs
-LINEAR = {"feti"}
+REWRITTEN = {"smalbe", "pdas", "clarabel"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
 
 
@@ -128,7 +126,7 @@ MEMBRANE = "finds where a membrane of 400 nodes touches"
 #: checks in which a solver takes seconds, mostly to reach its iteration limit
 LONG = [
     ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
-    ("projected-gradient", UNBOUNDED), ("apgd", UNBOUNDED), ("nsgs", MEMBRANE),
+    ("projected-gradient", UNBOUNDED), ("nsgs", MEMBRANE),
 ]  # fmt: skip
 #: planted solutions for all solvers: each shape once, and one shape in all storage
 #: formats
@@ -140,7 +138,7 @@ ONCE = ", sparse"
 #: one solver for each type of constraints that our solvers accept, one adapter of a
 #: single library, and one backend of each adapter of several libraries
 REPRESENTATIVES = {
-    "smalbe", "pdas", "feti", "nsgs", "bvls", "clarabel", "qpsolvers:quadprog",
+    "smalbe", "pdas", "nsgs", "clarabel", "qpsolvers:quadprog",
     "cvxpy:HIGHS",
 }  # fmt: skip
 #: checks of the other solvers
@@ -232,7 +230,7 @@ def test_weaknesses_are_documented(name):
     page = WEAKNESSES.read_text()
     weak, solved = weaknesses(CONCRETE[name])
 
-    assert bool(solved) is (name not in LINEAR)
+    assert solved
     assert f"| `{name}` |" in page
     assert [w for w in weak if line_of(name, *w) not in page] == []
 

@@ -339,9 +339,9 @@ params = { S = 2, n = 4 }
 
 
 @pytest.mark.slow
-def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path):
+def test_a_suite_measures_solvers_with_ranks_on_each_number(tmp_path):
     suite = tmp_path / "ranks.toml"
-    suite.write_text(SUITE.replace("ranks =", "copies = true\nranks ="))
+    suite.write_text(SUITE)
 
     results = mb.run(suite, out=tmp_path / "out")
 
@@ -349,15 +349,9 @@ def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path)
     asked = {name: (r.ranks, r.role) for name, r in found.items()}
     assert asked == {
         "smalbe": (1, ""), "smalbe ranks=2": (2, ""), "clarabel": (1, ""),
-        "smalbe copies=2": (2, "copies"),
     }  # fmt: skip
     assert found["smalbe ranks=2"].verdict == "verified"
     assert found["smalbe ranks=2"].qp.startswith(DISTRIBUTED_DIGEST)
-    # a copy computes the same bits as one process alone
-    assert found["smalbe copies=2"].verdict == "verified"
-    alone, copies = found["smalbe"], found["smalbe copies=2"]
-    assert (copies.objective, copies.counts) == (alone.objective, alone.counts)
-    assert copies.peak_mib > 1.5 * alone.peak_mib  # peak memory of both copies
 
 
 @dataclass
@@ -414,8 +408,6 @@ def test_the_same_number_of_ranks_gives_the_same_bits(by_ranks):
         ("ranks = [0]", "ranks = 0; expected a number of ranks"),
         ("ranks = [2, 2]", "expected distinct numbers"),
         ("ranks = 2", "ranks"),
-        ("ranks = [1]\ncopies = true", "copies = true needs a number of ranks above 1"),
-        ("ranks = [1, 2]\ncopies = 2", "copies = 2; expected true or false"),
     ],
 )
 def test_wrong_ranks_of_a_suite_are_refused(tmp_path, line, message):
@@ -521,15 +513,3 @@ def busy_rank(mark):
         and b"worker" in command
         and resident_mib(pid) > WITH_A_SHARE
     ]
-
-
-def test_records_contain_the_speed_of_communication(answers):
-    first, alone = answers
-    network = first.record.rank_network
-    assert network.keys() == {
-        "reduction_seconds", "message_seconds", "seconds_per_byte",
-    }  # fmt: skip
-    for mean, largest in network.values():
-        assert 0 <= mean <= largest < 1
-    assert network["reduction_seconds"][0] > 0
-    assert alone.record.rank_network == {}

@@ -57,7 +57,7 @@ OTHERS = (
     "obstacle/n=8", "obstacle/n=8/feti=4", "membranes/S=2/n=3",
     "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
 )  # fmt: skip
-#: linear cases, for which solvers other than `feti` take very long. All but the first
+#: linear cases, for which solvers other than `smalbe` take very long. All but the first
 #: are soft in bending or have nearly rigid internal motions
 PLATES = (
     "plate/Sx=12/Sy=1/n=2", "plate/Sx=40/Sy=1/n=1",
@@ -128,7 +128,7 @@ def solved(name: str, labels=tuple(SOLVERS)):
     case, _ = known(name)
     for label in labels:
         solver = SOLVERS[label]
-        if (name in PLATES and label != "feti") or solver.declines(case.qp):
+        if (name in PLATES and label != "smalbe") or solver.declines(case.qp):
             continue
         for tol in (1e-4, 1e-8):
             try:

@@ -19,7 +19,7 @@ from mortarbench.harness.distributed.vectors import (
 )
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.operators import SerialisableOperator
-from mortarbench.harness.registry import COPIES, SolverSpec
+from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.verify.certificate import UncertifiableError
 from mortarbench.harness.verify.verdicts import (
     certified,
@@ -75,7 +75,6 @@ def test_the_name_of_a_measurement_depends_only_on_what_is_measured():
         record(accuracy=1e-3).run_id,
         record(mode="sequence", accuracy=1e-3).run_id,
         record(spec={"ranks": 2}).run_id,
-        record(spec={"role": COPIES}).run_id,
     ]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch("[0-9a-f]{12}", name) for name in names)

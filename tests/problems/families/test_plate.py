@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 from mortarbench.harness import Case, InputError
 from mortarbench.problems.families.plate import Plate
 from mortarbench.problems.models.plate import dual_quantities, model
-from mortarbench.solvers.baselines.feti import FETI
 from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 pytestmark = pytest.mark.together
 
@@ -101,7 +101,7 @@ def test_the_cantilever_of_msolve_has_its_sizes():
 )  # fmt: skip
 def test_the_dual_has_the_displacement_of_the_plate(name):
     case = built(name)
-    s = FETI().prepare(case.qp, 1e-9)()
+    s = SMALBE().prepare(case.qp, 1e-9)()
     primal = case.mechanics.primal
     u = case.mechanics.inverse(-primal.q)
     back = case.mechanics.to_primal(s)

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 
 import mortarbench as mb
 from mortarbench.harness import Status
-from mortarbench.solvers.baselines import ipm_amg, multigrid
+from mortarbench.solvers.baselines import ipm_amg
 from mortarbench.solvers.baselines.ipm_amg import IPMAMG
 from mortarbench.solvers.baselines.pdas import PDAS
 
@@ -101,7 +101,7 @@ def test_the_limit_of_iterations_is_named_in_the_message():
 
 
 def test_conjugate_gradients_that_do_not_converge_end_the_solve(monkeypatch):
-    monkeypatch.setattr(multigrid, "MAX_CG", 1)
+    monkeypatch.setattr(ipm_amg, "MAX_CG", 1)
     s = IPMAMG().prepare(mb.build("cube-wall/n=4/primal").qp, 1e-8)()
     assert (s.status, s.message) == (Status.FAILED, "no convergence in 1 steps of CG")
 
