@@ -93,7 +93,7 @@ STEPS = key(10, 1, MAX_STEPS)
 METHODS = schema(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
 PLANES = schema(plane=choice("strain", "stress"))
 #: key of the gluing rows, which join the copies of a node (`problems.feti.subdomains`)
-GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
+GLUES = schema(glue=choice("orthonormal", "redundant"))
 #: key of clusters: number of subdomains per side of a cluster; 0 for no clusters
 CLUSTERS = schema(cluster=key(0, 0))
 #: keys of a decomposition into subdomains; `feti` is the largest number of cells along

@@ -14,7 +14,6 @@ components are eliminated. The m copies v_1 … v_m of a free component are glue
 of
 
 * ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
-* ``chain``: m − 1 rows  v_p − v_q = 0  of consecutive copies,
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
 
 Contact rows act on the average of the copies, because all copies are equal at the
@@ -74,10 +73,6 @@ def _orthonormal(m: int) -> NDArray[np.float64]:
     return np.asarray(np.linalg.qr(np.ones((m, 1)), mode="complete")[0][:, 1:].T)
 
 
-def _chain(m: int) -> NDArray[np.float64]:
-    return np.eye(m - 1, m) - np.eye(m - 1, m, 1)
-
-
 def _redundant(m: int) -> NDArray[np.float64]:
     p, q = np.array(list(combinations(range(m), 2))).T
     return np.asarray(np.eye(m)[p] - np.eye(m)[q])
@@ -86,7 +81,7 @@ def _redundant(m: int) -> NDArray[np.float64]:
 #: mapping from the name of the gluing to a function that returns the weights (rows, m)
 #: of m copies
 GLUE: Mapping[str, Weights] = MappingProxyType(
-    {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
+    {"orthonormal": _orthonormal, "redundant": _redundant}
 )
 
 

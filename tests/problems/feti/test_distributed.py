@@ -155,10 +155,10 @@ def ranks_do_not_lock_one_another_out(monkeypatch):
     scope="module",
     params=[
         lambda: on_one_process(Membranes(2, 3).in_subdomains("redundant")).decomposed,
-        lambda: decomposed_pair("chain", most=4)[2],
+        lambda: decomposed_pair("redundant", most=4)[2],
         lambda: decomposed_pair("orthonormal", most=4)[2],
     ],
-    ids=["membranes", "chain", "orthonormal"],
+    ids=["membranes", "redundant", "orthonormal"],
 )
 def torn(request):
     return request.param()

@@ -72,13 +72,11 @@ def test_without_rows_it_is_conjugate_gradients():
 @pytest.mark.parametrize(
     ("subdomains", "n", "glue", "kind", "steps"),
     [
-        ((8, 1), 4, "chain", "none", 18),
         ((8, 1), 4, "redundant", "none", 18),
         ((8, 1), 4, "orthonormal", "none", 16),
         ((8, 1), 8, "orthonormal", "none", 22),
         ((8, 1), 8, "redundant", "lumped", 14),
         ((8, 1), 8, "redundant", "dirichlet", 10),
-        ((16, 2), 4, "chain", "none", 33),
         ((16, 2), 4, "redundant", "none", 40),
         ((16, 2), 4, "orthonormal", "none", 25),
         ((16, 2), 4, "redundant", "lumped", 16),

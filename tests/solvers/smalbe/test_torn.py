@@ -62,7 +62,7 @@ def test_rows_of_torn_problems_are_sparse_with_a_flat_spectrum(answers):
     assert s.counts["P_products"] <= s.iterations + s.counts["expansion"] + 12
 
 
-@pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
+@pytest.mark.parametrize("glue", ["orthonormal", "redundant"])
 def test_the_displacement_is_that_of_the_undecomposed_body(glue):
     pieces, whole = torn(8, glue=glue), case(Nr=8, Nh=4, steps=1)
     u = pieces.recover(SMALBE().prepare(pieces.qp, 1e-9)())
