@@ -147,7 +147,14 @@ def test_unsupported_combinations_are_refused_by_name(press, name, message):
             "bodies:press.toml/glue=redundant/dual",
             "glue=redundant is not used by parts=0",
         ),
-        ("bodies:press.toml/feti=4/dual", "unknown key 'feti'"),
+        (
+            "bodies:press.toml/feti=4/dual",
+            "unknown key 'feti'; feti and parts exclude each other, .*expected parts, ",
+        ),
+        (
+            "greco/parts=4/dual",
+            "unknown key 'parts'; feti and parts exclude each other, .*expected feti, ",
+        ),
     ],
 )
 def test_keys_that_do_not_fit_are_refused_before_anything_is_built(

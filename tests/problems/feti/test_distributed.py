@@ -286,7 +286,7 @@ def test_subdomains_are_weighted_by_dense_blocks_and_connected_by_rows(
 ):
     seen = {}
 
-    def noted(graph, work, size, ranks, cluster):
+    def noted(graph, work, size, ranks):
         seen.update(graph=graph.toarray(), work=work, size=size)
         return np.arange(size.size) % ranks
 

@@ -33,12 +33,10 @@ CASES = (
     "plate/Sx=2/Sy=2/n=2/pattern=checkerboard/jump=10/dim=3/Sz=2/dual",
     "contact-patch/lower=3/upper=2/feti=2/dim=3/distort=0.2/dual",
     DISCS,
-    "beam-ring/Nr=3/Nh=2/steps=1/feti=2/glue=redundant/cluster=2/dual",
-    "plate/Sx=4/Sy=4/n=2/pattern=column/jump=10/cluster=2/dual",
 )
-#: cases of the default tests: each family of CASES, each gluing, friction, clusters,
-#: and three-dimensional bodies
-QUICK = (*CASES[1:4], CASES[5], *CASES[8:12], DISCS, CASES[16])
+#: cases of the default tests: each family of CASES, each gluing, friction, and
+#: three-dimensional bodies
+QUICK = (*CASES[1:4], CASES[5], *CASES[8:12], DISCS)
 ALL_CASES = [
     pytest.param(case, marks=[pytest.mark.slow] * (case not in QUICK)) for case in CASES
 ]

@@ -71,6 +71,22 @@ def test_the_displacement_is_that_of_the_undecomposed_body(glue):
     assert abs(u - v).max() <= 1e-8 * abs(v).max()
 
 
+@pytest.mark.parametrize("keys", ["feti=1", "feti=2"])
+@pytest.mark.parametrize("tol", [1e-8, 1e-10])
+def test_a_semidefinite_dual_ends_at_its_rounding_errors(keys, tol):
+    """Directions in the kernel of F do not enlarge the multipliers.
+
+    Without the rule for spent directions, these cases take 1000 products, and their
+    residuals are between 1e-7 and 1e-5.
+    """
+    qp = build(f"hertz-sphere/n=2/{keys}/glue=redundant/dual").qp
+    s = SMALBE().prepare(qp, tol)()
+
+    assert (s.status, s.message) == (Status.SOLVED, "converged")
+    assert kkt_residuals(qp, s).worst <= 5 * tol
+    assert s.counts["P_products"] < 150
+
+
 @pytest.mark.parametrize("tol", [1e-6, 1e-9])
 @pytest.mark.parametrize(
     "name",
