@@ -72,9 +72,7 @@ def case_of(
         contact = Contact(rows, c, friction.bound, friction.tangents)
         stage = problem.stages[path.last_of(choice.step)]
         layout = cached_layout(elastic, choice.size)
-        decomposed = decompose(
-            elastic, layout, choice.glue, stage, contact, choice.cluster
-        )
+        decomposed = decompose(elastic, layout, choice.glue, stage, contact)
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:

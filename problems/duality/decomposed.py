@@ -142,9 +142,7 @@ def decomposed_path(
 
     def pose(stage: Stage, at: State) -> DecomposedLinearisation:
         sides = linearise_sides(problem, layout, stage, at)
-        parts = decompose(
-            elastic, layout, choice.glue, stage, sides.contact, choice.cluster
-        )
+        parts = decompose(elastic, layout, choice.glue, stage, sides.contact)
         if previous:  # the bodies are unchanged, so reuse their subdomain classes
             previous[0] = LocalDual(previous[0].subdomains.with_problem(parts))
         else:
@@ -173,7 +171,7 @@ def distributed_qp_of(
     Raises
     ------
     InputError
-        If there are fewer subdomains (or clusters) than ranks, if the ranks computed
+        If there are fewer subdomains than ranks, if the ranks computed
         different subdomains, or if the fixed-point iteration for Coulomb's law does not
         converge or takes fewer iterates than the number that `choice` selects.
 
@@ -202,7 +200,6 @@ def decompose(
     glue: str,
     stage: Stage,
     contact: Contact,
-    cluster: int = 0,
 ) -> DecomposedProblem:
     """Return the decomposed problem of elastic bodies under the load of a `Stage`.
 
@@ -238,7 +235,6 @@ def decompose(
         lift=lift,
         glue=glue,
         contact=contact,
-        cluster=cluster,
     )
 
 

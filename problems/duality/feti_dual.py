@@ -7,9 +7,7 @@
 
 This is the dual of `problems.duality.dualisation`, assembled from subdomains (Total
 FETI; Dostál, Horák and Kučera 2006). F is an operator: a sum over subdomains, which is
-stored as plain arrays (`problems.feti.operators`). RᵀBᵀ is sparse. If averages join
-subdomains into clusters, K̃⁺ and RN replace K⁺ and R
-(`problems.feti.subdomain_classes.Clusters`).
+stored as plain arrays (`problems.feti.operators`). RᵀBᵀ is sparse.
 """
 
 from __future__ import annotations
@@ -46,13 +44,13 @@ def feti_dual(
     friction : friction law with a prescribed bound
 
     """
-    units, R, T = bodies.units, bodies.units.kernel, bodies.spread
+    domains, R, T = bodies.domains, bodies.domains.kernel, bodies.spread
     B, f, m_E, scale = bodies.B, bodies.f, bodies.equalities, bodies.scale
-    free = units.inverse(f)
+    free = domains.inverse(f)
     m_I = primal.h.size
     bound = friction.bound / scale[m_I:]
     qp = QP(
-        P=dual_operator(B, bodies.domains, m_E, bodies.clusters, bodies.redundant),
+        P=dual_operator(B, domains, m_E, bodies.redundant),
         q=bodies.c - B @ free,
         A=csr_array((B @ R).T),
         b=R.T @ f,
@@ -65,7 +63,7 @@ def feti_dual(
     B_I = contact_rows(primal, friction)[0]
 
     def displacement(s: Solution) -> Vector:
-        v = units.inverse(f - B.T @ s.x) - R @ s.y
+        v = domains.inverse(f - B.T @ s.x) - R @ s.y
         return np.asarray((T.T @ v) / copies)
 
     def recover(s: Solution) -> Solution:
@@ -78,7 +76,7 @@ def feti_dual(
 
 def feti_matrices(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
     """Return F, d, B, c and R of the dual, keyed by their names in the paper."""
-    R = bodies.units.kernel
+    R = bodies.domains.kernel
     return {"F": dual.P, "d": -dual.q, "B": bodies.B, "c": bodies.c, "R": R}
 
 
@@ -89,7 +87,7 @@ def decomposition_quantities(bodies: DecomposedBodies, dual: QP) -> dict[str, An
     * `kinds`: number of classes of congruent subdomains; each class has one factor
     * `torn_dofs`: number of displacement unknowns, including all copies
     * `multipliers`: number of rows of B
-    * `coarse_unknowns`: number of rigid motions of all subdomains or clusters
+    * `coarse_unknowns`: number of rigid motions of all subdomains
     * `explicit_subdomains`: number of subdomains with explicit blocks (K⁺)_bb and S_bb;
       for all other subdomains, every product requires a solve
     * `explicit_mib`: memory for these blocks, MiB

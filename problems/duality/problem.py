@@ -53,7 +53,6 @@ from mortarbench.problems.feti.subdivision import (
 from mortarbench.problems.feti.tearing import (
     compact_blocks,
     compact_boxes,
-    grid_positions,
 )
 
 #: function that linearises contact at a displacement (n,) in m
@@ -176,19 +175,7 @@ class StructuredSolids:
         first = np.cumsum([0] + [int(label.max()) + 1 for label in labels])
         label = np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
         named = np.unique(np.concatenate(list(self.sides.values())))
-        positions = [
-            at
-            for one, divisions in zip(labels, self.divisions, strict=True)
-            if (at := grid_positions(one, divisions)) is not None
-        ]
-        is_grid = len(positions) == len(labels)
-        return mesh_in_subdomains(
-            self.mesh,
-            label,
-            self.body,
-            named,
-            np.concatenate(positions) if is_grid else None,
-        )
+        return mesh_in_subdomains(self.mesh, label, self.body, named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,12 +374,10 @@ class Choice(NamedTuple):
     iterate: int = 0
     size: int = 0  #: argument of `Shape.layout`; 0 for undivided bodies
     glue: str = "orthonormal"  #: one of `problems.feti.subdomains.GLUE`
-    #: number of subdomains along a side of a cluster; 0 for no clusters
-    cluster: int = 0
 
 
 #: keys of a case that select one of the QPs of a problem
-CHOICES = ("step", "iterate", "feti", "parts", "glue", "cluster")
+CHOICES = ("step", "iterate", "feti", "parts", "glue")
 
 
 def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
@@ -416,7 +401,6 @@ def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
         p.get("iterate", 0),
         size,
         p.get("glue", "orthonormal"),
-        p.get("cluster", 0),
     )
 
 

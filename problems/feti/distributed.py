@@ -63,7 +63,6 @@ from mortarbench.problems.feti.operators import (
     touched_components,
 )
 from mortarbench.problems.feti.subdomain_classes import (
-    Clusters,
     Condensed,
     Dense,
     Subdomains,
@@ -86,7 +85,6 @@ def partition(
     B: csr_array,
     domains: Subdomains,
     ranks: int,
-    clusters: Clusters | None = None,
     discs: Sequence[Discs] = (),
 ) -> Partition:
     """Distribute the subdomains and the rows of B (m, N) over ranks.
@@ -97,7 +95,7 @@ def partition(
     Raises
     ------
     InputError
-        If there are fewer subdomains (or clusters) than ranks.
+        If there are fewer subdomains than ranks.
 
     """
     S = domains.class_of.size
@@ -114,8 +112,7 @@ def partition(
     touches.data[:] = 1
     work, size = _work(B, domains), np.diff(domains.start)
     graph = csr_array(touches.T @ touches)
-    cluster = None if clusters is None else clusters.cluster
-    rank = balanced_partition(graph, work, size, ranks, cluster)
+    rank = balanced_partition(graph, work, size, ranks)
     of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
     reach = csr_array(touches @ of_rank)
     reach.sort_indices()
@@ -153,7 +150,6 @@ def balanced_partition(
     work: NDArray[np.int64],
     size: NDArray[np.int64],
     ranks: int,
-    cluster: NDArray[np.int64] | None = None,
 ) -> NDArray[np.int64]:
     """Partition S subdomains over ranks, balancing both work and size.
 
@@ -166,7 +162,6 @@ def balanced_partition(
     ----------
     graph : (S, S) number of rows shared by each pair of subdomains
     work, size : (S,) work and size of each subdomain, each in an arbitrary unit
-    cluster : (S,) cluster of each subdomain; clusters are not split between ranks
 
     Returns
     -------
@@ -175,21 +170,16 @@ def balanced_partition(
     Raises
     ------
     InputError
-        If there are fewer subdomains (or clusters) than ranks.
+        If there are fewer subdomains than ranks.
 
     """
-    name = "subdomain"
-    if cluster is not None:
-        name, members = "cluster", np.arange(cluster.size)
-        sums = csr_array((np.ones_like(cluster), (members, cluster)))
-        graph, work, size = csr_array(sums.T @ graph @ sums), work @ sums, size @ sums
     if work.size < ranks:
         raise InputError(
-            f"{ranks} ranks for {work.size} {name}{'s' * (work.size > 1)}; expected at "
-            f"most one rank per {name}"
+            f"{ranks} ranks for {work.size} subdomain{'s' * (work.size > 1)}; expected "
+            "at most one rank per subdomain"
         )
     if ranks == 1:
-        return np.zeros(work.size if cluster is None else cluster.size, dtype=np.int64)
+        return np.zeros(work.size, dtype=np.int64)
     graph = graph.copy()
     graph.setdiag(0)
     graph.eliminate_zeros()
@@ -207,7 +197,7 @@ def balanced_partition(
         other = _partitioned(graph, (weight / weight.min()).astype(int), ranks, seed)
         if uneven(work, other) <= MAX_IMBALANCE and uneven(size, other) < best:
             rank, best = other, uneven(size, other)
-    return rank if cluster is None else rank[cluster]
+    return rank
 
 
 def _partitioned(
@@ -429,34 +419,11 @@ class RankOperator:
         solve = self._gram_inverse(csr_array(packed.B @ packed.BT))
         return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
 
-    def average_forces(self) -> DistributedColumns:
-        """Return a basis of the multipliers in range B with Fλ = 0, as rows (c, o).
-
-        These multipliers satisfy Bᵀλ = Cᵀμ for some μ, where C is the matrix of
-        `Clusters`. Hence the forces Bᵀλ do no work on displacements v with Cv = 0.
-        Without clusters, c = 0.
-        """
-        halo, packed, clusters = self.halo, self.local.packed, self.local.clusters
-        touched = csr_array((0, halo.rows.size))
-        if clusters is not None:
-            C = clusters.independent @ clusters.averages
-            touched = csr_array(C @ self.local.B.T)
-        counts = halo.ranks.comm.allgather(touched.shape[0])
-        first = sum(counts[: halo.ranks.rank])
-        solve = self._gram_inverse(csr_array(packed.B @ packed.BT))
-        rows = [np.zeros((0, halo.owned.size))]
-        for i in range(sum(counts)):
-            is_local = first <= i < first + touched.shape[0]
-            force = touched[[i - first]].toarray()[0] if is_local else None
-            part = np.zeros(halo.rows.size) if force is None else force
-            rows.append(solve(halo.accumulate(part))[None])
-        return DistributedColumns(csr_array(np.concatenate(rows)), halo.ranks)
-
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
         packed, ranks = self.local.packed, self.halo.ranks
         each, weights = self.local.weighted_blocks(kind, scaling)
-        blocks = self.local.stiffness_map(each, weights)
+        blocks = packed.block_diagonal(each)
         BW = scaled_columns(packed.B, weights)
         rows = RowsOverRanks.of(BW, self.halo)
         solve = self._gram_inverse(csr_array(BW @ packed.BT))
@@ -761,12 +728,12 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     Raises
     ------
     InputError
-        If there are fewer subdomains (or clusters) than ranks.
+        If there are fewer subdomains than ranks.
 
     """
     B, domains = operator.B, operator.domains
     discs = tuple(one for one in qp.sets if isinstance(one, Discs))
-    partitioned = partition(B, domains, ranks.size, operator.clusters, discs)
+    partitioned = partition(B, domains, ranks.size, discs)
     touched = np.flatnonzero(partitioned.reach[:, [ranks.rank]].toarray())
     reach = csr_array(partitioned.reach[touched])
     halo = build_halo(ranks, touched, reach, partitioned.owner[touched])
@@ -784,8 +751,6 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         operator.explicit[classes],
         operator.equalities,
         partial(condense_over_ranks, ranks=ranks),
-        operator.clusters
-        and operator.clusters.restrict(subdomains, classes, local_domains),
         operator.redundant,
     )
     owned = halo.rows[halo.owned]

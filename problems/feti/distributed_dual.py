@@ -14,7 +14,7 @@ The ranks exchange
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import chain, pairwise
 from typing import Any
@@ -86,7 +86,7 @@ class LocalDual:
         local = self.subdomains
         return np.asarray(
             local.rows.c[self.halo.owned]
-            - self.halo.accumulate(local.rows.B @ local.units.inverse(local.f))
+            - self.halo.accumulate(local.rows.B @ local.domains.inverse(local.f))
         )
 
     @cached_property
@@ -108,14 +108,12 @@ class LocalDual:
         )
         classes = tuple(kind.without_factor() for kind in domains.classes)
         unfactored = Subdomains(classes, domains.class_of)
-        clusters = self.subdomains.clusters
         local = DualOperator(
             rows.B,
             unfactored,
             self.explicit,
             rows.equalities,
             partial(condense_over_ranks, ranks=ranks),
-            clusters and replace(clusters, domains=unfactored),
             self.subdomains.problem.redundant,
         )
         qp = QP(
@@ -160,7 +158,7 @@ def dual_on(problem: DecomposedProblem, ranks: Ranks) -> LocalDual:
     Raises
     ------
     InputError
-        If there are fewer subdomains (or clusters) than ranks, or if the ranks computed
+        If there are fewer subdomains than ranks, or if the ranks computed
         different subdivisions.
 
     """
@@ -204,7 +202,7 @@ def distributed_qp(
     between = contact.bound.size - in_discs
     return DistributedQP(
         variables=local.rows.total,
-        equality_rows=local.unit_motions,
+        equality_rows=local.coarse_size,
         bounds=contact.rows.shape[0] - contact.bound.size + 2 * between,
         discs=in_discs // contact.tangents,
         share=dual.share,
@@ -235,7 +233,7 @@ def _decomposition(
         "kinds": len(set().union(*classes)),
         "torn_dofs": int(dofs),
         "multipliers": rows.total,
-        "coarse_unknowns": local.unit_motions,
+        "coarse_unknowns": local.coarse_size,
         "explicit_subdomains": int(formed),
         "explicit_mib": mib,
     }
@@ -245,7 +243,7 @@ def _digest(local: LocalSubdomains) -> str:
     """Return a digest of the QP that does not depend on the distribution over ranks.
 
     It is computed from the digests of the class, the load and the columns of B of each
-    subdomain, in the order of the subdomains, and from the contact data and clusters,
+    subdomain, in the order of the subdomains, and from the contact data,
     which are equal on all ranks.
     """
     domains, rows, contact = local.domains, local.rows, local.problem.contact
@@ -262,8 +260,6 @@ def _digest(local: LocalSubdomains) -> str:
         digests.append((int(local.number[s]), name))
     every = sorted(chain.from_iterable(local.ranks.comm.allgather(digests)))
     shared = [contact.rows.data, contact.c, contact.bound]
-    if local.problem.clusters is not None:
-        shared.append(local.problem.clusters)
     content = (*(name.encode() for _, name in every), *(v.tobytes() for v in shared))
     return hex_digest(content, 64)
 
@@ -280,7 +276,7 @@ def _replicated_partition(
     ------
     InputError
         If the subdomains or their ranks differ between ranks, or if there are fewer
-        subdomains (or clusters) than ranks.
+        subdomains than ranks.
 
     """
     ranks_of = subdomains_of(problem, ranks.size)
@@ -323,7 +319,7 @@ def _resultants(local: LocalSubdomains) -> Vector:
     """Return Rᵀf (r,) of all subdomains; the result is equal on every rank."""
     loaded = np.flatnonzero(local.f)
     resultants = local.resultants(loaded, local.f[loaded])
-    total = np.zeros(local.unit_motions)
+    total = np.zeros(local.coarse_size)
     for number, part in local.ranks.comm.allgather(
         (resultants.indices, resultants.data)
     ):

@@ -78,16 +78,15 @@ def local_solution(local: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolu
     """Recover the local displacement from the multipliers of the dual.
 
     The torn displacement is v = K⁺(f − Bᵀλ) − Rα, where α are the multipliers of
-    RᵀBᵀλ = Rᵀf. With clusters, K̃⁺ and RN replace K⁺ and R (see `Clusters`). The result
-    is the average of v over the copies of each node on all ranks (see
-    `problems.duality.feti_dual`). Eliminated components are zero.
+    RᵀBᵀλ = Rᵀf. The result is the average of v over the copies of each node on all
+    ranks (see `problems.duality.feti_dual`). Eliminated components are zero.
     """
     bodies, multiplicity = _local_bodies(local.floating)
-    T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_unit_motions]
+    T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_motions]
     multipliers = halo.gather(np.asarray(s.x))
     v = np.zeros(T.shape[0])
-    v[local.free] = local.units.inverse(local.f - local.rows.B.T @ multipliers)
-    v[local.free] -= local.units.kernel @ alpha
+    v[local.free] = local.domains.inverse(local.f - local.rows.B.T @ multipliers)
+    v[local.free] -= local.domains.kernel @ alpha
     u = bodies.reduction.completed(T.T @ v) / multiplicity
     z = contact_multipliers(local, halo, s)
     return LocalSolution(subdomains=local, bodies=bodies, u=u, z=z)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import block_diag, csc_array, csr_array
@@ -14,7 +13,6 @@ from mortarbench.harness.operators import Arrays, SerialisableOperator
 from mortarbench.problems.feti.distributed import local_share
 from mortarbench.problems.feti.operators import DualOperator, explicit_classes
 from mortarbench.problems.feti.subdomain_classes import (
-    Clusters,
     SubdomainClass,
     Subdomains,
 )
@@ -42,7 +40,6 @@ def dual_operator(
     B: csr_array,
     domains: Subdomains,
     equalities: int,
-    clusters: Clusters | None = None,
     redundant: bool = False,
 ) -> SerialisableOperator:
     """Return F = BK⁺Bᵀ as a serialisable operator; each class is stored once.
@@ -50,7 +47,6 @@ def dual_operator(
     Parameters
     ----------
     equalities : number of equality rows of B, which come first
-    clusters : clusters whose K̃⁺ replaces K⁺; None if averages join no subdomains
     redundant : True if the equality rows may be linearly dependent
 
     """
@@ -77,14 +73,6 @@ def dual_operator(
         arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in classes])
     if redundant:
         arrays["redundant"] = np.array(True)
-    if clusters is not None:
-        faces = csc_array(block_diag(clusters.faces, format="csc"))
-        arrays |= {
-            "cluster": clusters.cluster,
-            "faces_ends": np.cumsum([modes.shape[1] for modes in clusters.faces]),
-            **{f"faces_{part}": getattr(faces, part) for part in _PARTS},
-            **{f"joints_{part}": getattr(clusters.joints, part) for part in _PARTS},
-        }
     return SerialisableOperator(
         B.shape[0], NAME, arrays, {NAME: dual_operator_from_arrays}
     )
@@ -113,31 +101,10 @@ def dual_operator_from_arrays(arrays: Arrays) -> StoredOperator:
     )
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
-    clusters = _clusters(arrays, domains) if "cluster" in arrays else None
     return StoredOperator(
         B,
         domains,
         arrays["explicit"],
         int(arrays["equalities"]),
-        clusters=clusters,
         redundant="redundant" in arrays,
-    )
-
-
-def _clusters(arrays: Arrays, domains: Subdomains) -> Clusters:
-    data, indices, indptr = (arrays[f"faces_{part}"] for part in _PARTS)
-    ends, row, faces = np.append(0, arrays["faces_ends"]), 0, []
-    for template, (begin, end) in zip(domains.classes, pairwise(ends), strict=True):
-        columns, n = indptr[begin : end + 1], template.K.shape[0]
-        within = slice(columns[0], columns[-1])
-        modes = data[within], indices[within] - row, columns - columns[0]
-        faces.append(csr_array(csc_array(modes, shape=(n, end - begin))))
-        row += n
-    joints = tuple(arrays[f"joints_{part}"] for part in _PARTS)
-    coordinates = int(np.diff(ends)[domains.class_of].sum())
-    return Clusters(
-        domains=domains,
-        cluster=arrays["cluster"],
-        faces=tuple(faces),
-        joints=csr_array(joints, shape=(joints[2].size - 1, coordinates)),
     )

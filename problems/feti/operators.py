@@ -45,12 +45,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import (
-    block_diag,
     csc_array,
     csr_array,
     diags_array,
-    eye_array,
-    kron,
     vstack,
 )
 from scipy.sparse.csgraph import connected_components
@@ -63,13 +60,11 @@ from mortarbench.harness.distributed.sparse import (
     DirectSum,
     Identity,
     LinearMap,
-    Sum,
 )
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.blocks import BlockDiagonal
 from mortarbench.problems.feti.subdomain_classes import (
-    Clusters,
     Condensed,
     Dense,
     SubdomainClass,
@@ -86,10 +81,6 @@ STRIP_COLUMNS = 256
 CONTACT_SHIFT = 1e-8
 #: eigenvalues of a block of B W Bᵀ below this fraction of the largest count as zero
 EIGENVALUE_CUTOFF = 1e-10
-#: lower bound on the diagonal of B K̃⁺Bᵀ, relative to that of B K⁺Bᵀ. Residuals are
-#: scaled by 1/√diagonal; with this bound, relative rounding errors of 2⁻⁵³ are
-#: amplified to at most 1e5·2⁻⁵³, about 1e-11
-LEAST_DIAGONAL = 1e-10
 #: off-diagonal entries of B W Bᵀ below this fraction of the diagonal count as rounding
 #: errors
 COUPLING_ROUNDING = 1e-12
@@ -215,13 +206,12 @@ class DualOperator:
     condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
         condense_groups
     )
-    clusters: Clusters | None = None  #: None if averages join no subdomains
     redundant: bool = False  #: True if the equality rows may be linearly dependent
 
     @property
     def semidefinite(self) -> bool:
         """True if Fλ = 0 for some λ ≠ 0."""
-        return self.redundant or self.clusters is not None
+        return self.redundant
 
     def __call__(self, x: Dense) -> Dense:
         """Return Fx."""
@@ -233,7 +223,7 @@ class DualOperator:
         return self.packed.congruence(self.inverse_map)
 
     def diagonal(self) -> Vector:
-        """Return the diagonal of F, (m,); with clusters, see `LEAST_DIAGONAL`."""
+        """Return the diagonal of F, (m,)."""
         return self._diagonal
 
     def preconditioner(self, kind: str, scaling: str) -> Composition:
@@ -264,7 +254,7 @@ class DualOperator:
             self._preconditioners[kind, scaling] = Composition(
                 solve,
                 CompressedRows(B_D),
-                self.stiffness_map(blocks, weights),
+                self.packed.block_diagonal(blocks),
                 CompressedRows(csr_array(B_D.T)),
                 solve,
             )
@@ -304,16 +294,6 @@ class DualOperator:
             weights = np.ones_like(weights)
         return blocks, weights
 
-    def stiffness_map(self, blocks: Sequence[Any], weights: Vector) -> LinearMap:
-        """Return diag(D) on packed components; with clusters, see `average_free`.
-
-        blocks, weights : from `weighted_blocks`
-        """
-        separate = self.packed.block_diagonal(blocks)
-        if self.clusters is None:
-            return separate
-        return average_free(self.clusters, self.packed, separate, weights)
-
     @cached_property
     def packed(self) -> Packed:
         """Rows of B restricted to the components they touch."""
@@ -326,19 +306,12 @@ class DualOperator:
 
     @property
     def inverse_map(self) -> LinearMap:
-        """diag((K⁺)_bb), or (K̃⁺)_bb with clusters, as a map on packed components."""
+        """diag((K⁺)_bb) as a map on packed components."""
         return self._blocks.inverse_map
 
     @cached_property
     def _diagonal(self) -> Vector:
-        diagonal, joints = self.packed.diagonal(self.inverses), self._blocks.joints
-        if joints is None:
-            return diagonal
-        # if Cv = 0 implies that a row of Bv is zero, the diagonal entry of F for this
-        # row is only a rounding error, and residuals scaled by this entry would be of
-        # order one
-        joined = diagonal + joints.diagonal(self.packed.B)
-        return np.maximum(joined, LEAST_DIAGONAL * diagonal)
+        return self.packed.diagonal(self.inverses)
 
     @cached_property
     def _blocks(self) -> _Blocks:
@@ -350,12 +323,7 @@ class DualOperator:
         inverses, schur = (
             [blocks_of[i][k] for i in range(len(groups))] for k in (0, 1)
         )
-        separate = self.packed.block_diagonal(inverses)
-        if self.clusters is None:
-            return _Blocks(inverses, schur, separate, None)
-        joints = _joints(self.clusters, self.packed, inverses)
-        joined = Sum(separate, joints.linear_map)
-        return _Blocks(inverses, schur, joined, joints)
+        return _Blocks(inverses, schur, self.packed.block_diagonal(inverses))
 
 
 class _Blocks(NamedTuple):
@@ -363,159 +331,7 @@ class _Blocks(NamedTuple):
 
     inverses: list[Any]  #: (K⁺)_bb
     schur: list[Any]  #: S_bb
-    inverse_map: LinearMap  #: diag((K⁺)_bb), or (K̃⁺)_bb
-    joints: _Joints | None  #: (K̃⁺)_bb − diag((K⁺)_bb); None without clusters
-
-
-@dataclass(frozen=True, eq=False)
-class _Joints:
-    """The term −V M⁺Vᵀ of `Clusters` on packed components.
-
-    The columns of V for a subdomain are linear combinations of the columns
-    [(K⁺Φ)_b, R_b] of its class.
-    """
-
-    groups: tuple[Group, ...]
-    columns: list[Dense]  #: [(K⁺Φ)_b, R_b] (n_g, p_g) of each group
-    #: (k, p) coefficients of V, one row for each of the unknowns (μ_1, α_1, μ_2, α_2,
-    #: …) of clusters; the columns are packed like components
-    combine: csr_array
-    saddle_inverses: list[Vector]  #: upper triangle of M⁺ for each cluster
-    sizes: list[int]  #: number of unknowns of each cluster
-
-    @property
-    def linear_map(self) -> Composition:
-        """The term −V M⁺Vᵀ as a map on packed components."""
-        members = [group.members.size for group in self.groups]
-        sizes = [group.touched.size for group in self.groups]
-        rows = [np.ascontiguousarray(block.T) for block in self.columns]
-        return Composition(
-            BlockDiagonal(self.columns, [len(block) for block in rows], members),
-            CompressedRows(csr_array(-self.combine.T)),
-            BlockDiagonal(self.saddle_inverses, self.sizes, [1] * len(self.sizes)),
-            CompressedRows(self.combine),
-            BlockDiagonal(rows, sizes, members),
-        )
-
-    def diagonal(self, B: csr_array) -> Vector:
-        """Return the diagonal of −BV M⁺VᵀBᵀ (m,) for packed rows B."""
-        columns = [
-            kron(csr_array(block), eye_array(group.members.size), format="csr")
-            for group, block in zip(self.groups, self.columns, strict=True)
-        ]
-        U = csc_array(B @ (block_diag(columns, format="csr") @ self.combine.T))
-        total, end = np.zeros(B.shape[0]), 0
-        for n, triangle in zip(self.sizes, self.saddle_inverses, strict=True):
-            inverse = BlockDiagonal([triangle], [n], [1])(np.eye(n))
-            part = U[:, end : end + n]
-            rows = np.unique(part.indices)
-            part, end = csr_array(part[rows]), end + n
-            for begin in range(0, rows.size, STRIP_COLUMNS):
-                strip = slice(begin, begin + STRIP_COLUMNS)
-                u = part[strip].toarray()
-                total[rows[strip]] -= np.einsum("ij,ij->i", u @ inverse, u)
-        return total
-
-
-def average_free(
-    clusters: Clusters, packed: Packed, D: LinearMap, weights: Vector
-) -> Composition:
-    """Return (I − Π)D(I − Π)ᵀ with Π = Cᵀ(CWCᵀ)⁺CW, for packed components.
-
-    F vanishes on all multipliers with Bᵀλ = Cᵀμ. Rounding errors would therefore let
-    the iterates of preconditioned conjugate gradients drift along these multipliers.
-    The range of B_DΠ consists of such multipliers, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0
-    because C = LᵀB for some L. Hence the factors I − Π change the image of the
-    preconditioner only by such multipliers, and remove its component along them.
-
-    weights : (M,) diagonal of W, equal for all subdomains of a class
-    """
-    members = [group.members.size for group in packed.groups]
-    modes, weighted, grams, end = [], [], [], 0
-    for group, faces in zip(packed.groups, clusters.faces, strict=True):
-        Phi = faces[group.touched].toarray()
-        w = weights[end : end + Phi.shape[0] * group.members.size : group.members.size]
-        end += Phi.shape[0] * group.members.size
-        modes.append(Phi)
-        weighted.append(w[:, None] * Phi)
-        grams.append(Phi.T @ weighted[-1])
-    place = _column_places(clusters, packed, [Phi.shape[1] for Phi in modes])
-    C = csr_array(
-        (clusters.joints.data, place[clusters.joints.indices], clusters.joints.indptr),
-        clusters.joints.shape,
-    )
-    q = [Phi.shape[1] for Phi in modes]
-    n = [Phi.shape[0] for Phi in modes]
-
-    def oblique(left: list[Dense], right: list[Dense]) -> Sum:
-        rows = [np.ascontiguousarray(block.T) for block in right]
-        sizes = np.diff(clusters.rows).tolist()
-        minus_joined = Composition(
-            BlockDiagonal(left, q, members),
-            CompressedRows(csr_array(-C.T)),
-            BlockDiagonal(clusters.gram_inverses(grams), sizes, [1] * len(sizes)),
-            CompressedRows(C),
-            BlockDiagonal(rows, n, members),
-        )
-        return Sum(Identity(D.shape[0]), minus_joined)
-
-    return Composition(oblique(modes, weighted), D, oblique(weighted, modes))
-
-
-def _column_places(
-    clusters: Clusters, packed: Packed, sizes: Sequence[int]
-) -> NDArray[np.int64]:
-    """Return the indices (Σq,) of the coordinates of `Clusters`, packed by groups.
-
-    sizes : number of columns of each group; the columns of the coordinates come first
-    """
-    first = clusters.coordinates
-    place, end = np.empty(first[-1], dtype=np.int64), 0
-    for group, faces, p in zip(packed.groups, clusters.faces, sizes, strict=True):
-        members, q = group.members, np.arange(faces.shape[1])[:, None]
-        number = end + q * members.size + np.arange(members.size)
-        place[first[members] + q] = number
-        end += p * members.size
-    return place
-
-
-def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joints:
-    """Compute the term −V M⁺Vᵀ of clusters from the blocks (K⁺)_bb of the groups."""
-    columns, compliance, end = list[Dense](), list[Dense](), 0
-    modes = clusters.domains.modes
-    first_motion = np.cumsum(modes) - modes
-    motion = np.empty(modes.sum(), dtype=np.int64)  # indices of packed columns
-    for group, inverse, faces in zip(
-        packed.groups, inverses, clusters.faces, strict=True
-    ):
-        Phi = faces[group.touched].toarray()
-        image = BlockDiagonal([inverse], [group.touched.size], [1])(Phi)
-        compliance.append(Phi.T @ image)
-        columns.append(np.hstack([image, group.template.R[group.touched]]))
-        (q, p), members = (Phi.shape[1], columns[-1].shape[1]), group.members
-        place = end + np.arange(p * members.size).reshape(p, members.size)
-        motion[first_motion[members] + np.arange(p - q)[:, None]] = place[q:]
-        end += place.size
-    coordinate = _column_places(clusters, packed, [M.shape[1] for M in columns])
-    order, sizes = clusters.unknowns
-    C = clusters.joints
-    combine = vstack(
-        [
-            csr_array((C.data, coordinate[C.indices], C.indptr), (C.shape[0], end)),
-            csr_array(
-                (np.ones(motion.size), motion, np.arange(motion.size + 1)),
-                (motion.size, end),
-            ),
-        ],
-        format="csr",
-    )
-    return _Joints(
-        packed.groups,
-        columns,
-        csr_array(combine[order]),
-        clusters.saddle_inverses(compliance),
-        sizes,
-    )
+    inverse_map: LinearMap  #: diag((K⁺)_bb)
 
 
 def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:

@@ -1,9 +1,7 @@
 """Extreme eigenvalues of F on the null space of the equalities, with error bounds.
 
 Let G = RᵀBᵀ be the matrix of the equalities of the dual, and P the orthogonal projector
-onto ker G ∩ range B. If averages join subdomains into clusters, F is singular on this
-subspace, and P projects onto the part of the subspace that is orthogonal to ker F. The
-spectra are those of
+onto ker G ∩ range B. The spectra are those of
 
     P F P                 in the inner product  xᵀy,
     P M P F               in the inner product  xᵀF y,
@@ -26,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh_tridiagonal
-from scipy.sparse import csc_matrix, csr_array, vstack
+from scipy.sparse import csc_matrix
 from sksparse.cholmod import cholesky
 
 from mortarbench.harness import Vector
@@ -183,15 +181,13 @@ def projector(F: RankOperator, G: DistributedColumns) -> Product:
 
     """
     within = F.onto_rows()
-    excluded = csr_array(vstack([G.part, F.average_forces().part]))
-    if not excluded.shape[0]:
+    if not G.part.shape[0]:
         return within
-    rows = DistributedColumns(excluded, G.ranks)
-    factor = cholesky(csc_matrix(rows.gram()))
+    factor = cholesky(csc_matrix(G.gram()))
 
     def project(x: Vector) -> Vector:
         y = within(x)
-        return np.asarray(y - np.asarray(rows.T @ factor(rows @ y)))
+        return np.asarray(y - np.asarray(G.T @ factor(G @ y)))
 
     return project
 

@@ -10,31 +10,25 @@ differ only by a rigid motion, such as those in one layer of a ring, are congrue
 have the same stiffness matrix, factor and explicit blocks; their rotations enter B. A
 displacement u (n,) of the undivided bodies corresponds to v = T u, where T has one d×d
 block per copy of a node.
-
-In hybrid FETI (Klawonn and Rheinbach 2010, Comput. Methods Appl. Mech. Eng. 199),
-subdomains are joined into clusters by equal averages over common faces (`Clusters`). A
-cluster has the rigid motions of a single body, which reduces the coarse problem.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag as block_diagonal
-from scipy.linalg import cho_solve, eigh, lapack, null_space, qr
-from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
+from scipy.linalg import cho_solve, lapack, null_space, qr
+from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze, cholesky
 
 from mortarbench.harness import Vector
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.factor import with_int32
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.blocks import BlockDiagonal
 
 Dense = NDArray[np.float64]
 _STRIP = 256  #: right-hand sides per solve; bounds the memory for the solutions
@@ -244,219 +238,6 @@ class Subdomains:
         return v
 
 
-#: eigenvalues of C_cC_cᵀ below this fraction of the largest indicate dependent rows,
-#: where C_c are the rows of C of one cluster. The modes of faces are orthonormal, so
-#: that all other eigenvalues are much larger
-DEPENDENT_SHARE = 1e-10
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Clusters:
-    """Clusters of subdomains; averages over common faces are equal within a cluster.
-
-    ::
-
-        min ½vᵀKv − bᵀv   subject to   Cv = 0
-
-    Row i of C is the difference between the averages of two subdomains, for one mode of
-    their common face. With v = K⁺(b − Cᵀμ) − Rα and V = [K⁺Cᵀ, R], the solution is
-
-        v = K̃⁺b − RNβ,   K̃⁺ = K⁺ − V M⁺Vᵀ,   M = ⎡CK⁺Cᵀ  CR⎤
-                                                  ⎣RᵀCᵀ    0⎦
-
-    with arbitrary β. The columns of N are an orthonormal basis of ker CR. They describe
-    the motions of clusters as rigid bodies, and the columns of RN span the kernel of K
-    on {v : Cv = 0}. M is block diagonal, with one block per cluster. The Moore-Penrose
-    inverse M⁺ is used because rows of C may be linearly dependent. K̃⁺ is positive
-    semidefinite.
-
-    The modes of a face are its rigid motions, orthonormal over its nodes. The columns
-    of Φ_k are the modes of all faces at which some member of class k is joined. C is
-    stored as a matrix that acts on the coordinates Φ_kᵀv_s of all subdomains s, in the
-    order of the subdomains.
-    """
-
-    domains: Subdomains  #: floating subdomains
-    cluster: NDArray[np.int64]  #: (S,) cluster of each subdomain, from 0
-    faces: tuple[csr_array, ...]  #: Φ (n_k, q_k) for each class
-    joints: csr_array  #: C in these coordinates (c, Σq), rows ordered by clusters
-
-    @cached_property
-    def coordinates(self) -> NDArray[np.int64]:
-        """First coordinate of each subdomain, then the total number, (S + 1,)."""
-        sizes = np.array([modes.shape[1] for modes in self.faces])
-        return np.concatenate([[0], np.cumsum(sizes[self.domains.class_of])])
-
-    @cached_property
-    def averages(self) -> csr_array:
-        """C (c, N), which maps torn unknowns to differences of averages."""
-        faces = block_diag([self.faces[k] for k in self.domains.class_of], format="csc")
-        return csr_array(self.joints @ faces.T)
-
-    @cached_property
-    def members(self) -> tuple[NDArray[np.int64], ...]:
-        """Subdomains of each cluster."""
-        order = np.argsort(self.cluster, kind="stable")
-        return tuple(np.split(order, np.cumsum(np.bincount(self.cluster))[:-1]))
-
-    @cached_property
-    def rows(self) -> NDArray[np.int64]:
-        """First row of C of each cluster, then the number of rows, (clusters + 1,)."""
-        subdomain = np.searchsorted(
-            self.coordinates, self.joints.indices[self.joints.indptr[:-1]], side="right"
-        )
-        cluster = self.cluster[subdomain - 1]
-        return np.searchsorted(cluster, np.arange(len(self.members) + 1))
-
-    @cached_property
-    def unknowns(self) -> tuple[NDArray[np.int64], list[int]]:
-        """Order of the unknowns (μ, α) by clusters, (μ_1, α_1, μ_2, α_2, …).
-
-        The order is given as indices (c + r,) in (μ, α); the second array is the number
-        of unknowns of each cluster.
-        """
-        start = np.concatenate([[0], np.cumsum(self.domains.modes)]) + self.rows[-1]
-        parts = [
-            np.concatenate(
-                [np.arange(first, end), *(np.arange(*start[[s, s + 1]]) for s in own)]
-            )
-            for first, end, own in zip(
-                self.rows[:-1], self.rows[1:], self.members, strict=True
-            )
-        ]
-        return np.concatenate(parts), [part.size for part in parts]
-
-    @cached_property
-    def _joined(self) -> list[_Joined]:
-        return [self._join(c) for c in range(len(self.members))]
-
-    def _join(self, c: int) -> _Joined:
-        domains = self.domains
-        rows = self.joints[self.rows[c] : self.rows[c + 1]]
-        parts, gram, motions = [], np.zeros((rows.shape[0],) * 2), list[Dense]()
-        for s in self.members[c]:
-            k = domains.class_of[s]
-            coordinates = slice(self.coordinates[s], self.coordinates[s + 1])
-            J, modes = rows[:, coordinates].toarray(), self.faces[k]
-            parts.append((int(k), J))
-            gram += J @ (modes.T @ modes).toarray() @ J.T
-            motions.append(J @ (modes.T @ domains.classes[k].R))
-        CR = np.concatenate(motions, axis=1)
-        # subdomains joined by faces move as one body, with as many motions as one
-        # subdomain
-        last = domains.classes[domains.class_of[self.members[c][0]]].R.shape[1] - 1
-        N = eigh(CR.T @ CR, subset_by_index=(0, last))[1]
-        size, modes = np.linalg.eigh(gram)
-        dependent = size <= DEPENDENT_SHARE * size.max(initial=0.0)
-        return _Joined(parts, CR, N, modes[:, ~dependent], modes[:, dependent])
-
-    @cached_property
-    def motions(self) -> csr_array:
-        """N (r, r̃), with rows in the order of the rigid motions of all subdomains."""
-        order, rows = self.unknowns[0], self.rows[-1]
-        N = block_diag([part.N for part in self._joined], format="csr")
-        return csr_array(N[np.argsort(order[order >= rows])])
-
-    @property
-    def independent(self) -> csr_array:
-        """Orthonormal combinations (c', c) that reduce C to independent rows."""
-        return csr_array(
-            block_diag([part.independent.T for part in self._joined], format="csr")
-        )
-
-    @cached_property
-    def kernel(self) -> csr_array:
-        """RN (N, r̃), a basis of the rigid motions of all clusters."""
-        return csr_array(self.domains.kernel @ self.motions)
-
-    def saddle_inverses(self, compliance: Sequence[Dense]) -> list[Vector]:
-        """Return the upper triangle of M⁺ for each cluster, column by column.
-
-        compliance : ΦᵀK⁺Φ (q_k, q_k) of each class
-        """
-        return [upper_triangle(one.saddle_inverse(compliance)) for one in self._joined]
-
-    def gram_inverses(self, grams: Sequence[Dense]) -> list[Vector]:
-        """Return the upper triangle of (CWCᵀ)⁺ for each cluster, column by column.
-
-        grams : ΦᵀWΦ (q_k, q_k) of each class, with a diagonal matrix W of weights
-        """
-        return [upper_triangle(one.gram_inverse(grams)) for one in self._joined]
-
-    @cached_property
-    def _saddle_inverse(self) -> BlockDiagonal:
-        """M⁺ in the order of `unknowns`."""
-        compliance = [
-            modes.T @ template.inverse(modes.toarray())
-            for template, modes in zip(self.domains.classes, self.faces, strict=True)
-        ]
-        sizes = self.unknowns[1]
-        return BlockDiagonal(self.saddle_inverses(compliance), sizes, [1] * len(sizes))
-
-    def inverse(self, b: Vector) -> Vector:
-        """Apply K̃⁺ to a torn vector (N,)."""
-        domains, C, R = self.domains, self.averages, self.domains.kernel
-        order = self.unknowns[0]
-        t = np.concatenate([C @ domains.inverse(b), R.T @ b])
-        y = np.empty_like(t)
-        y[order] = self._saddle_inverse(t[order])
-        mu, alpha = np.split(y, [C.shape[0]])
-        return np.asarray(domains.inverse(b - C.T @ mu) - R @ alpha)
-
-    def restrict(
-        self, subdomains: Nodes, classes: Nodes, domains: Subdomains
-    ) -> Clusters:
-        """Return the restriction to a selection of clusters.
-
-        subdomains : all subdomains of the selected clusters, ascending
-        classes : distinct classes of these subdomains, ascending
-        domains : these subdomains as `Subdomains`
-        """
-        columns = np.concatenate(
-            [np.arange(*self.coordinates[[s, s + 1]]) for s in subdomains]
-        )
-        touched = np.isin(self.joints.indices[self.joints.indptr[:-1]], columns)
-        return Clusters(
-            domains=domains,
-            cluster=np.unique(self.cluster[subdomains], return_inverse=True)[1],
-            faces=tuple(self.faces[k] for k in classes),
-            joints=csr_array(self.joints[touched][:, columns]),
-        )
-
-
-class _Joined(NamedTuple):
-    """The c rows of C that belong to one cluster, with their kernels and ranges."""
-
-    parts: list[tuple[int, Dense]]  #: class and columns of C (c, q_k) of each subdomain
-    CR: Dense  #: (c, r)
-    N: Dense  #: (r, r̃) orthonormal basis of ker CR
-    independent: Dense  #: (c, c') orthonormal basis of range C
-    dependent: Dense  #: (c, c − c') orthonormal basis of ker Cᵀ
-
-    def product(self, coordinates: Sequence[Dense]) -> Dense:
-        """Return CACᵀ (c, c) of a block diagonal A from the blocks ΦᵀAΦ of classes."""
-        total = np.zeros((self.CR.shape[0],) * 2)
-        for k, J in self.parts:
-            total += J @ coordinates[k] @ J.T
-        return total
-
-    def gram_inverse(self, grams: Sequence[Dense]) -> Dense:
-        """Return (CWCᵀ)⁺ on the range of C from the blocks ΦᵀWΦ of all classes."""
-        U = self.independent
-        return _symmetric(U @ np.linalg.inv(U.T @ self.product(grams) @ U) @ U.T)
-
-    def saddle_inverse(self, compliance: Sequence[Dense]) -> Dense:
-        """Return M⁺ of this cluster from the blocks ΦᵀK⁺Φ of all classes."""
-        S, (c, r) = self.product(compliance), self.CR.shape
-        # scale CK⁺Cᵀ to the magnitude of CR, which is of order one
-        unit = float(np.trace(S)) / c if c else 1.0
-        M = np.block([[S / unit, self.CR], [self.CR.T, np.zeros((r, r))]])
-        Z = block_diagonal(self.dependent, self.N)  # ker M
-        inverse = np.linalg.inv(M + Z @ Z.T) - Z @ Z.T
-        scale = np.append(np.full(c, unit**-0.5), np.full(r, unit**0.5))
-        return _symmetric(scale[:, None] * inverse * scale)
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DecomposedBodies:
     """A contact problem on decomposed bodies, in nondimensional form.
@@ -478,13 +259,7 @@ class DecomposedBodies:
     scale: Vector  #: positive factors of the contact rows
     f: Vector  #: (N,) torn load; Tᵀf is the load of the undivided bodies
     equalities: int  #: number of rows of supports and gluing, which come first
-    clusters: Clusters | None = None  #: None if averages join no subdomains
     redundant: bool = False  #: True if rows of supports and gluing may be dependent
-
-    @property
-    def units(self) -> Subdomains | Clusters:
-        """Floating units that B glues: clusters, or subdomains without clusters."""
-        return self.clusters or self.domains
 
     @property
     def start(self) -> NDArray[np.int64]:

@@ -14,7 +14,6 @@ components are eliminated. The m copies v_1 … v_m of a free component are glue
 of
 
 * ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
-* ``chain``: m − 1 rows  v_p − v_q = 0  of consecutive copies,
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
 
 Contact rows act on the average of the copies, because all copies are equal at the
@@ -40,11 +39,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array, hstack
+from scipy.sparse import bsr_array, coo_array, csr_array
 
-from mortarbench.harness import InputError, Vector
+from mortarbench.harness import Vector
 from mortarbench.harness.distributed.vectors import Ranks, single_process
-from mortarbench.problems.fem.mesh import Nodes, dofs_of
+from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import balanced_partition
 from mortarbench.problems.feti.subdivision import (
     Integers,
@@ -53,9 +52,7 @@ from mortarbench.problems.feti.subdivision import (
     SubdomainNodes,
 )
 from mortarbench.problems.feti.subdomain_classes import (
-    Clusters,
     DecomposedBodies,
-    Dense,
     SubdomainClass,
     Subdomains,
 )
@@ -74,10 +71,6 @@ def _orthonormal(m: int) -> NDArray[np.float64]:
     return np.asarray(np.linalg.qr(np.ones((m, 1)), mode="complete")[0][:, 1:].T)
 
 
-def _chain(m: int) -> NDArray[np.float64]:
-    return np.eye(m - 1, m) - np.eye(m - 1, m, 1)
-
-
 def _redundant(m: int) -> NDArray[np.float64]:
     p, q = np.array(list(combinations(range(m), 2))).T
     return np.asarray(np.eye(m)[p] - np.eye(m)[q])
@@ -86,7 +79,7 @@ def _redundant(m: int) -> NDArray[np.float64]:
 #: mapping from the name of the gluing to a function that returns the weights (rows, m)
 #: of m copies
 GLUE: Mapping[str, Weights] = MappingProxyType(
-    {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
+    {"orthonormal": _orthonormal, "redundant": _redundant}
 )
 
 
@@ -139,7 +132,6 @@ class DecomposedProblem:
     eliminated: bool = False
     contact: Contact
     glue: str  #: name of the gluing, one of `GLUE`
-    cluster: int = 0  #: number of subdomains per side of a cluster; 0: no clusters
 
     @property
     def piece_of(self) -> Integers:
@@ -151,39 +143,6 @@ class DecomposedProblem:
     def redundant(self) -> bool:
         """True if rows of supports and gluing may be linearly dependent."""
         return self.glue == "redundant"
-
-    @cached_property
-    def clusters(self) -> NDArray[np.int64] | None:
-        """Cluster of each subdomain (S,), numbered body by body; None without clusters.
-
-        Raises
-        ------
-        InputError
-            If the subdomains of a body do not form a grid.
-
-        """
-        if not self.cluster:
-            return None
-        if (positions := self.layout.positions) is None:
-            raise InputError(
-                f"cluster={self.cluster} is not built for subdomains that do not form "
-                "a grid; expected no cluster, or bodies cut into grids of subdomains"
-            )
-        places = np.column_stack([self.layout.body, positions // self.cluster])
-        return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
-
-    def joined_pairs(self) -> tuple[Nodes, Nodes]:
-        """Return the pairs of subdomains in one cluster that share a face.
-
-        The result consists of two arrays (k,).
-        """
-        one, other, _ = self.layout.shared_node_counts()
-        clusters, positions = self.clusters, self.layout.positions
-        assert clusters is not None
-        assert positions is not None
-        apart = np.abs(positions[one] - positions[other]).sum(axis=1)
-        joined = (clusters[one] == clusters[other]) & (apart == 1)
-        return one[joined], other[joined]
 
     @cached_property
     def contact_scale(self) -> Vector:
@@ -420,33 +379,6 @@ class LocalSubdomains:
             counts[number] = count
         return np.concatenate([[0], np.cumsum(counts)])
 
-    @cached_property
-    def clusters(self) -> Clusters | None:
-        """The local clusters; None if the problem has no clusters."""
-        return None if self.problem.clusters is None else _local_clusters(self)
-
-    @property
-    def units(self) -> Subdomains | Clusters:
-        """Local floating units: clusters if there are any, otherwise subdomains."""
-        return self.clusters or self.domains
-
-    @property
-    def local_unit_motions(self) -> NDArray[np.int64]:
-        """Global numbers of the rigid motions of the local units."""
-        if (clusters := self.problem.clusters) is None:
-            return self.local_motions
-        # all units float and have the same number of motions
-        per_unit = self.unit_motions // (clusters.max() + 1)
-        local = np.unique(clusters[self.number])
-        return np.asarray((local[:, None] * per_unit + np.arange(per_unit)).ravel())
-
-    @property
-    def unit_motions(self) -> int:
-        """Size of the coarse problem: the number of rigid motions of all units."""
-        if (clusters := self.problem.clusters) is None:
-            return self.coarse_size
-        return (int(clusters.max()) + 1) * int(self.motions[1])
-
     @property
     def local_motions(self) -> NDArray[np.int64]:
         """Global numbers of the rigid motions of the local subdomains."""
@@ -475,7 +407,7 @@ class LocalSubdomains:
         return np.asarray(load[self.free])
 
     def resultants(self, unknown: Nodes, value: Vector) -> csr_array:
-        """Return the work (k, r) of k single forces on the rigid motions of all units.
+        """Return the work (k, r) of k single forces on all rigid motions.
 
         unknown : (k,) torn unknowns
         value : (k,) a force at each of these unknowns
@@ -490,15 +422,9 @@ class LocalSubdomains:
         along = np.arange(ends[-1]) - np.repeat(ends[:-1], modes)
         entries = R[np.repeat(at, modes) + along] * np.repeat(value, modes)
         column = np.repeat(self.motions[self.number[of]], modes) + along
-        resultants = csr_array(
+        return csr_array(
             (entries, column, ends), shape=(unknown.size, self.coarse_size)
         )
-        if self.clusters is None:
-            return resultants
-        N = self.clusters.motions.tocoo()
-        places = self.local_motions[N.row], self.local_unit_motions[N.col]
-        shape = self.coarse_size, self.unit_motions
-        return csr_array(resultants @ csr_array((N.data, places), shape=shape))
 
     @cached_property
     def _shape(self) -> Callable[[Nodes, Nodes, bool], Vector] | None:
@@ -543,7 +469,6 @@ class LocalSubdomains:
             scale=self.problem.contact_scale,
             f=self.f,
             equalities=rows.equalities,
-            clusters=self.clusters,
             redundant=self.problem.redundant,
         )
 
@@ -562,7 +487,7 @@ class LocalSubdomains:
         are reused because their assembly is expensive.
         """
         copy = replace(self, problem=problem)
-        same = ("number", "nodes", "_classified", "_distinct", "clusters")
+        same = ("number", "nodes", "_classified", "_distinct")
         vars(copy).update({k: v for k, v in vars(self).items() if k in same})
         return copy
 
@@ -588,7 +513,7 @@ def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     Raises
     ------
     InputError
-        If there are fewer subdomains (or clusters) than ranks.
+        If there are fewer subdomains than ranks.
 
     """
     of, d = problem.layout, problem.components
@@ -612,85 +537,7 @@ def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     touches.data[:] = 1
     graph = csr_array(graph + graph.T) + csr_array(touches.T @ touches)
     work = (d * touched) ** 2
-    return balanced_partition(csr_array(graph), work, of.sizes, ranks, problem.clusters)
-
-
-def _local_clusters(local: LocalSubdomains) -> Clusters:
-    """Return the local clusters, with averages over the faces inside them.
-
-    A face consists of all common nodes of two adjacent subdomains, including clamped
-    nodes. The modes Φ_s of subdomain s are its rigid motions, restricted to these nodes
-    and orthonormalised. After rotation to global axes by Q_s, the modes of both
-    subdomains span the same space: Q_1Φ_1 = Q_2Φ_2Tᵀ with an orthogonal matrix T. The
-    averages are therefore equal if Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0.
-    """
-    nodes, domains, d = local.nodes, local.domains, local.problem.components
-    r = domains.classes[0].R.shape[1]
-    faces = [dict[bytes, tuple[int, Dense]]() for _ in domains.classes]
-
-    def side(s: int, node: Nodes) -> tuple[int, Dense]:
-        """Return the index of a face in its class, and its modes in global axes."""
-        k = domains.class_of[s]
-        if (key := node.tobytes()) not in faces[k]:
-            modes = np.linalg.qr(domains.classes[k].R[dofs_of(node, d)])[0]
-            faces[k][key] = len(faces[k]), modes
-        number, modes = faces[k][key]
-        if d == 1:
-            return number, modes
-        turned = local.rotation[s] @ modes.reshape(node.size, d, r)
-        return number, turned.reshape(modes.shape)
-
-    ends, turns = [], []
-    pairs = np.stack(local.problem.joined_pairs(), axis=1)
-    pairs = np.searchsorted(
-        local.number, pairs[local.rank[pairs[:, 0]] == local.ranks.rank]
-    )
-    labels = np.asarray(local.problem.clusters)[local.number]
-    for pair in pairs[np.argsort(labels[pairs[:, 0]], kind="stable")].tolist():
-        a, b = (nodes.number[slice(*nodes.start[[s, s + 1]])] for s in pair)
-        places = np.intersect1d(a, b, assume_unique=True, return_indices=True)[1:]
-        (i, one), (j, other) = map(side, pair, places)
-        ends.append([pair[0], i, pair[1], j])
-        turns.append(one.T @ other)
-
-    first = np.cumsum([0, *(r * len(faces[k]) for k in domains.class_of)])
-    joined = np.array(ends, dtype=np.int64).reshape(-1, 2, 2)
-    start = first[joined[:, :, 0]] + r * joined[:, :, 1]
-    column, other_column = (one[:, None] + np.arange(r) for one in start.T)
-    row = np.arange(column.size).reshape(-1, r)
-    T = np.reshape(turns, (-1, r, r))
-    joints = csr_array(
-        (
-            np.append(np.ones(row.size), -T.ravel()),
-            (
-                np.append(row.ravel(), np.repeat(row, r, axis=1).ravel()),
-                np.append(column.ravel(), np.repeat(other_column, r, axis=0).ravel()),
-            ),
-        ),
-        shape=(row.size, first[-1]),
-    )
-    return Clusters(
-        domains=domains,
-        cluster=np.unique(labels, return_inverse=True)[1],
-        faces=tuple(
-            _columns(of_class, template.R.shape[0], d)
-            for of_class, template in zip(faces, domains.classes, strict=True)
-        ),
-        joints=joints,
-    )
-
-
-def _columns(faces: Mapping[bytes, tuple[int, Dense]], n: int, d: int) -> csr_array:
-    """Return the modes (n, q) of faces, whose keys are the bytes of their nodes."""
-    columns = [csr_array((n, 0))]
-    for key, (_, modes) in faces.items():
-        at = dofs_of(np.frombuffer(key, dtype=np.int64), d)
-        places = (
-            np.repeat(at, modes.shape[1]),
-            np.tile(np.arange(modes.shape[1]), at.size),
-        )
-        columns.append(csr_array((modes.ravel(), places), (n, modes.shape[1])))
-    return csr_array(hstack(columns))
+    return balanced_partition(csr_array(graph), work, of.sizes, ranks)
 
 
 def _local_rows(local: LocalSubdomains) -> _Rows:

@@ -71,7 +71,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         new = primal_form(pair.qp)
     else:
         start = perf_counter()
-        own = on_one_process(pair.in_subdomains(p["glue"], p["cluster"]))
+        own = on_one_process(pair.in_subdomains(p["glue"]))
         pieces, certify_by_subdomains = own.decomposed, certifier(own, pair.qp.P)
         new = feti_dual(pieces, pair.qp)
         seconds = perf_counter() - start
@@ -160,11 +160,10 @@ class Membranes:
         along = hat_integrals(self.side, 0.0, 1.0)
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
-    def in_subdomains(self, rows: str, cluster: int = 0) -> DecomposedProblem:
+    def in_subdomains(self, rows: str) -> DecomposedProblem:
         """Return the decomposed problem of both membranes.
 
         rows : type of the rows that join copies of a node, the value of the key `glue`
-        cluster : number of subdomains per side of a cluster; 0 for no clusters
         """
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
@@ -178,7 +177,6 @@ class Membranes:
             names=NAMES,
             load=self.load,
             glue=rows,
-            cluster=cluster,
             fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
         )
@@ -224,7 +222,7 @@ class Membranes:
 def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     """Return the decomposed problem for `params`, which must contain all keys."""
     p: Any = params
-    return Membranes(p["S"], p["n"]).in_subdomains(p["glue"], p["cluster"])
+    return Membranes(p["S"], p["n"]).in_subdomains(p["glue"])
 
 
 def results(params: Mapping[str, Value], dual: LocalDual) -> Results:

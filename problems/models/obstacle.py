@@ -154,7 +154,6 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
         fixed=boundary,
         contact=Contact(rows, -psi, np.zeros(0)),
         glue=p["glue"],
-        cluster=p["cluster"],
     )
 
 
@@ -176,7 +175,6 @@ def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
         fixed=csr_array(qp.A).indices,
         contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)),
         glue=p["glue"],
-        cluster=p["cluster"],
     )
 
 

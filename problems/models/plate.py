@@ -86,7 +86,7 @@ from mortarbench.problems.feti.subdomains import (
     LocalSubdomains,
     on_one_process,
 )
-from mortarbench.problems.feti.tearing import blocks, grid_positions
+from mortarbench.problems.feti.tearing import blocks
 
 LENGTH = 1.0  #: l, unit of length, m
 LOAD = 1e6  #: F₀, the load: N/m in 2D, N in 3D
@@ -259,7 +259,6 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
         E=moduli[:1],
         names=("plate",),
         glue=p["glue"],
-        cluster=p["cluster"],
         material=_material(p),
         assemble_class=partial(elastic_class, D=D, E=moduli),
         load=force_lookup(_pull(layout, shape.sides["right"], p["load"])),
@@ -331,8 +330,7 @@ def _layout(
         return Layout.of(shape.parts, side)
     named = np.unique(np.concatenate(list(shape.sides.values())))
     label = blocks(shape.divisions[0], side)
-    positions = grid_positions(label, shape.divisions[0])
-    return mesh_in_subdomains(shape.mesh, label, shape.body, named, positions)
+    return mesh_in_subdomains(shape.mesh, label, shape.body, named)
 
 
 def _material(p: Mapping[str, Any]) -> NDArray[np.int64]:
