@@ -25,7 +25,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from select import EPOLLIN, PIPE_BUF, epoll
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -285,29 +285,10 @@ def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
     return True
 
 
-class RankCosts(NamedTuple):
-    """Costs of a solve on several ranks, each a pair (mean, largest) over the ranks.
-
-    The tables are empty for a solve in a single process.
-    """
-
-    seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by category of work
-    counts: Mapping[str, tuple[float, float]] = {}  #: counts by operation
-
-    def fields(self) -> dict[str, Any]:
-        """Return the tables as fields of a record."""
-        return {f"rank_{name}": table for name, table in self._asdict().items()}
-
-
 class ParallelSolver:
     """Solver on rank 0 that sends orders to the other ranks.
 
     The ranks jointly solve one QP, and each rank has a share of the QP.
-
-    Attributes
-    ----------
-    spent : cost of the last solve on the ranks
-
     """
 
     def __init__(self, solver: Solver, ranks: Ranks, emit: Emit) -> None:
@@ -319,7 +300,6 @@ class ParallelSolver:
         self._emission_error: Exception | None = None
         self._path = Path()
         self._memory_limit: float | None = None
-        self.spent = RankCosts()
         self._local_solution: Solution | None = None
 
     def emit(
@@ -416,9 +396,8 @@ class ParallelSolver:
 
         def solve() -> Solution:
             self._order({})
-            self._local_solution, result = _solve_on_ranks(run, share, self._ranks)
-            assert result is not None  # on rank 0
-            solution, self.spent = result
+            self._local_solution, solution = _solve_on_ranks(run, share, self._ranks)
+            assert solution is not None  # on rank 0
             return solution
 
         return solve
@@ -486,37 +465,24 @@ def _share(qp: QP, ranks: Ranks) -> Share:
 
 def _solve_on_ranks(
     run: Callable[[], Solution], share: Share, ranks: Ranks
-) -> tuple[Solution, tuple[Solution, RankCosts] | None]:
+) -> tuple[Solution, Solution | None]:
     """Solve the local share of a QP.
 
     Returns
     -------
     the local slice of the solution, and on rank 0 also the entire solution with the
-    costs over all ranks; None on other ranks
+    memory of the ranks; None on other ranks
 
     """
-    ranks.clear()
     s = run()
-    # copy before `share.whole`, whose communication does not belong to the solve
-    seconds, counts = dict(ranks.seconds), dict(ranks.counts)
     solution = share.whole(s)
-    peak = memory_mib("VmHWM") or 0.0
-    costs = ranks.comm.gather((seconds, counts, peak))
-    if solution is None or costs is None:
+    peaks = ranks.comm.gather(memory_mib("VmHWM") or 0.0)
+    if solution is None or peaks is None:
         return s, None
-    *tables, peaks = zip(*costs, strict=True)
     reported = {
         **solution.reported,
         "ranks": ranks.size,
         "rank_peak_mib_largest": max(peaks),
         "rank_peak_mib_mean": sum(peaks) / ranks.size,
     }
-    spent = RankCosts(*map(_mean_and_largest, tables))
-    return s, (replace(solution, reported=reported), spent)
-
-
-def _mean_and_largest(
-    each: Sequence[Mapping[str, float]],
-) -> dict[str, tuple[float, float]]:
-    values = {name: [float(one[name]) for one in each] for name in each[0]}
-    return {name: (sum(v) / len(v), max(v)) for name, v in values.items()}
+    return s, replace(solution, reported=reported)

@@ -57,7 +57,7 @@ from mortarbench.harness.processes.protocol import (
     answer_requests,
     source_of,
 )
-from mortarbench.harness.processes.ranks import ParallelSolver, RankCosts, follow
+from mortarbench.harness.processes.ranks import ParallelSolver, follow
 from mortarbench.harness.qp import QP, Vector, no_rows
 from mortarbench.harness.record import finite, journal_name
 from mortarbench.harness.solution import Solution, Status
@@ -186,7 +186,6 @@ class _SolverHost:
         _limit_memory(None)
         s = timed.solution
         write_point(Path(request["out"]), s)
-        spent = RankCosts() if self.parallel is None else self.parallel.spent
         evaluated = dict[str, Any]()
         if source.is_shared and self.parallel is not None:
             events.reached("measured", {})
@@ -202,7 +201,7 @@ class _SolverHost:
             "worked_seconds": timed.worked_seconds,
             "solves": timed.solves,
             # fields that the parent copies to the record unchanged
-            "record": {"canary_seconds": canary, **spent.fields()},
+            "record": {"canary_seconds": canary},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
