@@ -168,11 +168,6 @@ class Record(Measurement):
     threads: int | None = None  #: largest thread count of any library in the worker
     cpu: int | None = None  #: number of the CPU to which the worker was bound
     ranks: int = 1  #: number of MPI processes of the solve
-    #: [mean, largest] over ranks of the seconds spent in each category of work, by
-    #: name; see `harness.distributed.vectors.PARTS`
-    rank_seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: [mean, largest] over ranks of the numbers of reductions, messages and bytes
-    rank_counts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     #: "cold" for a single case; "sequence" if results of earlier steps may be reused;
     #: "sequence, tighten=θ" for a sequence with tightening tolerances, see
     #: `Record.tighten`
@@ -437,8 +432,6 @@ def _check(r: Record) -> None:
     _check_seconds(r)
     _check_nested("iterations", r.iterations, 0)
     _check_nested("reported", r.reported, MAX_LEVELS)
-    _check_spent("rank_seconds", r.rank_seconds)
-    _check_spent("rank_counts", r.rank_counts)
 
 
 def _check_seconds(r: Record) -> None:
@@ -446,14 +439,6 @@ def _check_seconds(r: Record) -> None:
         if value and not SECONDS[0] <= value <= SECONDS[1]:
             raise ValueError(
                 f"{name} = {value!r}; expected 0, or {SECONDS[0]:g} to {SECONDS[1]:g}"
-            )
-
-
-def _check_spent(where: str, spent: Mapping[str, tuple[float, float]]) -> None:
-    for part, pair in spent.items():
-        if not min(pair) >= 0:
-            raise ValueError(
-                f"{where}[{shown(part)}] = {pair!r}; expected two numbers of at least 0"
             )
 
 

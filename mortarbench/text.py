@@ -185,10 +185,6 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
         ("iterations", _text(r.iterations)),
         ("counts", _text(r.counts)),
         ("solver data", _text(r.reported)),
-        *(
-            (f"ranks, {name}", f"{mean:.3g} s (largest {largest:.3g})")
-            for name, (mean, largest) in r.rank_seconds.items()
-        ),
         ("prepare", _text(r.prepare_seconds, timed, digits=3)),
         ("solve", _text(r.solve_seconds, timed, digits=3)),
         ("peak memory", _text(r.peak_mib, "MiB", digits=4)),

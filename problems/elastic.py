@@ -103,7 +103,7 @@ def one_step(
     friction: FrictionLaw | None = None,
     reference: Reference | None = None,
     parts: int = 0,
-    glue: Literal["orthonormal", "chain", "redundant"] = "orthonormal",
+    glue: Literal["orthonormal", "redundant"] = "orthonormal",
 ) -> Case:
     """Return the case of `bodies` under their full load, linearised at u = 0.
 

@@ -93,12 +93,10 @@ STEPS = key(10, 1, MAX_STEPS)
 METHODS = schema(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
 PLANES = schema(plane=choice("strain", "stress"))
 #: key of the gluing rows, which join the copies of a node (`problems.feti.subdomains`)
-GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
-#: key of clusters: number of subdomains per side of a cluster; 0 for no clusters
-CLUSTERS = schema(cluster=key(0, 0))
+GLUES = schema(glue=choice("orthonormal", "redundant"))
 #: keys of a decomposition into subdomains; `feti` is the largest number of cells along
 #: the side of a subdomain, H/h, or 0 for undivided bodies
-DECOMPOSITION = schema(feti=key(0, 0), **GLUES, **CLUSTERS)
+DECOMPOSITION = schema(feti=key(0, 0), **GLUES)
 DIMENSION = schema(dim=choice(2, 3))
 #: mapping from a key to its only value that three-dimensional families support
 PLANE_ONLY: Mapping[str, Value] = {"kinematics": "linear", "plane": "strain"}
@@ -261,7 +259,7 @@ def check_decomposition(
     key : key that requests subdomains
     what : meaning of this key, for the message
     """
-    for name, default in defaults_of({**GLUES, **CLUSTERS}).items():
+    for name, default in defaults_of(GLUES).items():
         if not params[key] and params.get(name, default) != default:
             raise InputError(
                 f"{family}: {name}={params[name]} is not used by {key}=0, which "
@@ -279,10 +277,10 @@ def other_decomposition(key: str, keys: Container[str]) -> str:
             "feti and parts exclude each other, only bodies:PATH.toml takes parts; "
             "expected feti, the largest number of cells along the side of a subdomain"
         )
-    if key in ("feti", *CLUSTERS) and "parts" in keys:
+    if key == "feti" and "parts" in keys:
         return (
-            f"{key} and parts exclude each other, as {key} needs subdomains in a "
-            "grid; expected parts, the number of subdomains"
+            "feti and parts exclude each other, as feti needs a structured grid; "
+            "expected parts, the number of subdomains"
         )
     return ""
 

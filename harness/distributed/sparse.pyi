@@ -41,9 +41,6 @@ class Identity(LinearMap):
 class DirectSum(LinearMap):
     def __init__(self, *maps: LinearMap) -> None: ...
 
-class Sum(LinearMap):
-    def __init__(self, *maps: LinearMap) -> None: ...
-
 class BorderedFactor(LinearMap):
     least_pivot: float
     least_inner_pivot: float

@@ -389,38 +389,6 @@ cdef class DirectSum(LinearMap):
         return 0
 
 
-cdef class Sum(LinearMap):
-    """The sum x ↦ A₁x + … + Aᵣx of maps of equal shape."""
-
-    cdef tuple maps
-    cdef double *term
-    cdef Py_ssize_t room
-
-    def __init__(self, *maps):
-        for map_ in maps:
-            self.expect(map_.shape[0], maps[0].shape[0])
-            self.expect(map_.shape[1], maps[0].shape[1])
-        self.maps = maps
-        self.n, self.k = maps[0].shape
-        self.shape = self.n, self.k
-
-    def __dealloc__(self):
-        free(self.term)
-
-    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
-        cdef LinearMap map_
-        cdef Py_ssize_t i, size = self.n * columns
-        if size > self.room:
-            self.term = resized(self.term, size)
-            self.room = size
-        memset(y, 0, size * sizeof(double))
-        for map_ in self.maps:
-            map_.apply(x, self.term, columns)
-            for i in range(size):
-                y[i] += self.term[i]
-        return 0
-
-
 cdef double *resized(double *held, Py_ssize_t size) except NULL:
     held = <double *> realloc(held, max(size, 1) * sizeof(double))
     if not held:

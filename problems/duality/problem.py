@@ -53,7 +53,6 @@ from mortarbench.problems.feti.subdivision import (
 from mortarbench.problems.feti.tearing import (
     compact_blocks,
     compact_boxes,
-    grid_positions,
 )
 
 #: function that linearises contact at a displacement (n,) in m
@@ -176,19 +175,7 @@ class StructuredSolids:
         first = np.cumsum([0] + [int(label.max()) + 1 for label in labels])
         label = np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
         named = np.unique(np.concatenate(list(self.sides.values())))
-        positions = [
-            at
-            for one, divisions in zip(labels, self.divisions, strict=True)
-            if (at := grid_positions(one, divisions)) is not None
-        ]
-        is_grid = len(positions) == len(labels)
-        return mesh_in_subdomains(
-            self.mesh,
-            label,
-            self.body,
-            named,
-            np.concatenate(positions) if is_grid else None,
-        )
+        return mesh_in_subdomains(self.mesh, label, self.body, named)
 
 
 @dataclass(frozen=True, eq=False)

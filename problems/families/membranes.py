@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from mortarbench.problems.families.declared import DeclaredFamily
 from mortarbench.problems.ranges import (
-    CLUSTERS,
     GLUES,
     check_memory,
     key,
@@ -22,7 +21,7 @@ class Membranes(DeclaredFamily):
     """Two membranes in contact along an edge; the right one floats."""
 
     name = "membranes"
-    keys = schema(S=key(2, 1), n=key(8, 1), **GLUES, **CLUSTERS)
+    keys = schema(S=key(2, 1), n=key(8, 1), **GLUES)
     forms = ("primal", "dual")
     model = "membranes.membranes"
     cells = ("n",)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from mortarbench.harness import InputError
 from mortarbench.problems.families.declared import DeclaredFamily
 from mortarbench.problems.ranges import (
-    CLUSTERS,
     DIMENSION,
     GLUES,
     PLANES,
@@ -41,7 +40,6 @@ class Plate(DeclaredFamily):
         **PLANES,
         supports=choice("rows", "eliminated"),
         **GLUES,
-        **CLUSTERS,
         **DIMENSION,
         Sz=key(1, 1),
     )
@@ -70,12 +68,6 @@ class Plate(DeclaredFamily):
             raise InputError(
                 f"{self.name}: supports=eliminated leaves a single subdomain without "
                 "any row of constraints; expected more subdomains, or supports=rows"
-            )
-
-        if p["supports"] == "eliminated" and p["cluster"]:
-            raise InputError(
-                f"{self.name}: cluster={p['cluster']} with supports=eliminated is not "
-                "built; expected no cluster, or supports=rows"
             )
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:

@@ -120,11 +120,6 @@ class Layout:
         )
         return Places(body, column, row)
 
-    @property
-    def positions(self) -> NDArray[np.int64]:
-        """Column and row of each block within its grid, (S, 2)."""
-        return np.stack(self.block[1:], axis=1).astype(np.int64)
-
     @cached_property
     def _blocks_per_row(self) -> NDArray[np.int64]:
         """Number of blocks along a row of each grid."""

@@ -57,13 +57,6 @@ class Subdivision(Protocol):
         """Body of each subdomain, (S,)."""
 
     @property
-    def positions(self) -> NDArray[np.int64] | None:
-        """Positions (S, dim) of subdomains in the grid of their body.
-
-        None if the subdomains of a body do not form a grid.
-        """
-
-    @property
     def sizes(self) -> NDArray[np.int64]:
         """Number of nodes of each subdomain, (S,)."""
 
@@ -134,7 +127,6 @@ class ListedSubdivision:
     part: Callable[[int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
     labelling: Callable[[], NDArray[np.int64]]  #: function that computes `label`
-    positions: NDArray[np.int64] | None = None
 
     @property
     def label(self) -> NDArray[np.int64]:
@@ -325,7 +317,6 @@ def mesh_in_subdomains(
     label: NDArray[np.int64],
     body: NDArray[np.int64],
     named: Nodes,
-    positions: NDArray[np.int64] | None = None,
 ) -> ListedSubdivision:
     """Return the subdivision of a stored mesh by the labels of its cells.
 
@@ -333,7 +324,6 @@ def mesh_in_subdomains(
     ----------
     label, body : (E,) subdomain and body of each cell
     named : nodes to list even if only one subdomain contains them
-    positions : see `Subdivision`
 
     """
     points, cells, N = mesh.points, mesh.cells, len(mesh.points)
@@ -362,5 +352,4 @@ def mesh_in_subdomains(
         part=part,
         position=points.__getitem__,
         labelling=lambda: label,
-        positions=positions,
     )

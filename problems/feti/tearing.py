@@ -59,21 +59,6 @@ def blocks(
     return label
 
 
-def grid_positions(
-    label: NDArray[np.int64], divisions: tuple[int, ...]
-) -> NDArray[np.int64] | None:
-    """Return the positions of blocks in a grid, (blocks, dim); None without a grid.
-
-    label, divisions : see `blocks`
-    """
-    first = np.unique(label, return_index=True)[1]
-    starts = np.unravel_index(first, divisions[::-1])
-    along = [np.unique(start, return_inverse=True)[1] for start in starts[::-1]]
-    positions = np.stack(along, axis=1)
-    # if rows of blocks are cut at different lines, some positions in the grid are empty
-    return positions if np.prod(positions.max(axis=0) + 1) == first.size else None
-
-
 Block = tuple[slice, slice]  #: ranges of rows and columns of cells
 #: lengths of cell sides, first along columns, then along rows; each length is the
 #: product of two factors, one for the row and one for the column of the cell

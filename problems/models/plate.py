@@ -85,7 +85,7 @@ from mortarbench.problems.feti.subdomains import (
     DecomposedProblem,
     TornBodies,
 )
-from mortarbench.problems.feti.tearing import blocks, grid_positions
+from mortarbench.problems.feti.tearing import blocks
 
 LENGTH = 1.0  #: l, unit of length, m
 LOAD = 1e6  #: F₀, the load: N/m in 2D, N in 3D
@@ -297,8 +297,7 @@ def _layout(
         return Layout.of(shape.parts, side)
     named = np.unique(np.concatenate(list(shape.sides.values())))
     label = blocks(shape.divisions[0], side)
-    positions = grid_positions(label, shape.divisions[0])
-    return mesh_in_subdomains(shape.mesh, label, shape.body, named, positions)
+    return mesh_in_subdomains(shape.mesh, label, shape.body, named)
 
 
 def _material(p: Mapping[str, Any]) -> NDArray[np.int64]:

@@ -23,9 +23,9 @@ from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 MULTIGRID = "ipm-amg"  #: solver that forms a separate route
 #: keys that choose a decomposition; they do not change the mesh
-DECOMPOSITION = ("feti", "glue", "parts", "cluster")
+DECOMPOSITION = ("feti", "glue", "parts")
 #: values of `Route.kind` in a complete map
-KINDS = ("primal", "primal, multigrid", "dual", "dual-bounds", "TFETI", "hybrid TFETI")
+KINDS = ("primal", "primal, multigrid", "dual", "dual-bounds", "TFETI")
 PRIMAL = KINDS[:2]
 
 
@@ -217,14 +217,14 @@ def _stop(
 
 def _route(o: Outcome) -> Route:
     r = o.first
-    keys = {k: r.params.get(k) for k in ("feti", "parts", "cluster")}
+    keys = {k: r.params.get(k) for k in ("feti", "parts")}
     layout = ", ".join(f"{k}={v}" for k, v in keys.items() if v)
     if not layout:
         kind = r.form
         if kind == PRIMAL[0] and base_label(o) == MULTIGRID:
             kind = PRIMAL[1]
     else:
-        kind = "hybrid TFETI" if keys["cluster"] else "TFETI"
+        kind = "TFETI"
     return Route(kind, layout, r.ranks)
 
 

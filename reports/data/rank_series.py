@@ -8,12 +8,10 @@ solve.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from mortarbench.harness.running.pairs import paired_ratio, unpaired_ratio
 from mortarbench.reports.data.evidence import Evidence, Outcome
@@ -23,13 +21,6 @@ from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 
 PHASES = ("prepare", "solve")
 ALIKE = 0.05  #: largest relative difference in dofs per rank within a weak series
-
-
-class Part(NamedTuple):
-    """Time, count or memory of the ranks of a solve: medians over the repeats."""
-
-    mean: float  #: mean over the ranks
-    largest: float  #: maximum over the ranks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -178,36 +169,14 @@ def _ratio(
     return Interval(value, low, high, COVERAGE, ratio.pairs)
 
 
-def rank_parts(o: Outcome) -> dict[str, Part]:
-    """Return the time of the ranks in each part of the solve, s, by name."""
-    return _parts(r.rank_seconds for r in o.records)
+def rank_memory(o: Outcome) -> float | None:
+    """Return the largest peak memory of a rank, MiB; None if unknown.
 
-
-def rank_counts(o: Outcome) -> dict[str, Part]:
-    """Return the numbers of reductions, messages and bytes of the ranks, by name."""
-    return _parts(r.rank_counts for r in o.records)
-
-
-def rank_memory(o: Outcome) -> Part | None:
-    """Return the peak memory of the ranks, MiB; None if unknown."""
-    ends = ("mean", "largest")
-    peaks = [
-        [r.reported.get(f"rank_peak_mib_{end}") for end in ends] for r in o.records
-    ]
-    numbers = [of for of in peaks if all(isinstance(v, int | float) for v in of)]
-    if not numbers:
-        return None
-    mean, largest = np.median(np.array(numbers, dtype=float), axis=0)
-    return Part(float(mean), float(largest))
-
-
-def _parts(tables: Iterable[Mapping[str, Any]]) -> dict[str, Part]:
-    filled = [table for table in tables if table]
-    return {
-        name: Part(*(float(median(t[name][end] for t in filled)) for end in (0, 1)))
-        for name in (filled[0] if filled else ())
-        if all(name in t for t in filled)
-    }
+    The value is the median over the repeats.
+    """
+    peaks = [r.reported.get("rank_peak_mib_largest") for r in o.records]
+    numbers = [peak for peak in peaks if isinstance(peak, int | float)]
+    return float(median(numbers)) if numbers else None
 
 
 def _cpus(evidence: Evidence) -> int | None:

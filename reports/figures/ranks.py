@@ -1,4 +1,4 @@
-"""Solves on several ranks: speed-up, parts of the time, weak scaling."""
+"""Solves on several ranks: speed-up, weak scaling."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from mortarbench.reports.data.rank_series import (
     PHASES,
     StrongSeries,
     WeakSeries,
-    rank_parts,
 )
 from mortarbench.reports.document.figure import (
     Axis,
@@ -18,16 +17,11 @@ from mortarbench.reports.document.figure import (
     Look,
     Mark,
     Panel,
-    Row,
-    Segments,
     Series,
-    categories,
     in_rows,
 )
 from mortarbench.reports.figures.style import (
-    COLOURS,
     GUIDE,
-    LEGEND_LINE,
     curve,
     legible,
     log,
@@ -37,9 +31,7 @@ from mortarbench.reports.figures.style import (
 from mortarbench.reports.statistics.intervals import Interval
 
 _LONG = 72  #: largest number of characters of a name in a legend of one column
-_BAR = 9.0  #: width of a bar, points
 _BEYOND = 1.5  #: largest factor by which intervals extend an axis beyond the values
-_REST = "#9aa2ad"  #: colour of the time outside the listed parts
 _ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up on one rank
 
 
@@ -77,41 +69,6 @@ def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
         *curve((p for p in measured if not s.crowded(p[0])), _line(style), s.solver),
         *curve((p for p in measured if s.crowded(p[0])), hollow, s.solver),
     ]
-
-
-def parts_figure(series: Sequence[tuple[StrongSeries, int]]) -> Figure:
-    """Draw each solve on several ranks as a bar of its parts, as means over ranks."""
-    parts = [rank_parts(s.answers[n]) for s, n in series]
-    named = list(dict.fromkeys(name for of in parts for name in of))
-    colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(named)}
-    marks = []
-    for i, ((s, n), of) in enumerate(zip(series, parts, strict=True)):
-        o, start = s.answers[n], 0.0
-        whole = t.value if (t := o.seconds("solve")) is not None else 0.0
-        means = {name: part.mean for name, part in of.items()}
-        for name, taken in {**means, "rest": whole - sum(means.values())}.items():
-            if taken > 0:
-                marks.append(
-                    Segments(
-                        ends=((start, -float(i), start + taken, -float(i)),),
-                        colour=colours.get(name, _REST),
-                        width=_BAR,
-                        solver=s.solver,
-                        runs=(o.run_ids,),
-                    )
-                )
-                start += taken
-    keys = [Key(label=name, look=_bar(colours.get(name, _REST))) for name in named]
-    keys.append(Key(label="rest", look=_bar(_REST)))
-    names = [f"{n} ranks, {legible(s.case, 44)}" for s, n in series]
-    panel = Panel(
-        x=Axis(label="solve time in s", low=0.0),
-        y=categories(names),
-        marks=tuple(marks),
-        grid="x",
-    )
-    figure = with_legend((Row(panels=(panel,)),), keys, 6, 0.0)
-    return replace(figure, height=0.9 + LEGEND_LINE + 0.26 * len(series))
 
 
 def weak_figure(series: Sequence[WeakSeries]) -> Figure:
@@ -184,10 +141,6 @@ def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
 
 def _line(style: Look) -> Look:
     return replace(style, dash=())
-
-
-def _bar(colour: str) -> Look:
-    return Look(colour=colour, width=6.0)
 
 
 def _figure(panels: Sequence[Panel], keys: Sequence[Key], columns: int) -> Figure:

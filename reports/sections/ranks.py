@@ -1,4 +1,4 @@
-"""One solve on several ranks: strong and weak scaling, parts of times."""
+"""One solve on several ranks: strong and weak scaling."""
 
 from __future__ import annotations
 
@@ -10,12 +10,9 @@ from mortarbench.reports.data.rank_series import (
     ALIKE,
     PHASES,
     Member,
-    Part,
     StrongSeries,
     WeakSeries,
-    rank_counts,
     rank_memory,
-    rank_parts,
     strong_series,
     weak_series,
 )
@@ -25,7 +22,6 @@ from mortarbench.reports.document.formatting import TIMED, significant
 from mortarbench.reports.document.layout import Cell, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.ranks import (
-    parts_figure,
     strong_figure,
     weak_figure,
 )
@@ -63,8 +59,6 @@ def ranks(a: Analysis) -> Iterator[layout.Part]:
         yield _strong_table(solves, "prepare")
         yield _strong_table(solves, "solve")
     yield from map(_weak_table, weak)
-    several = [each for each in solves if each[1] in each[0].several]
-    yield from _part_tables(several)
     yield from _pictures(strong, weak)
 
 
@@ -89,14 +83,24 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
     def row(s: StrongSeries, n: int, o: Outcome) -> tuple[Cell, ...]:
         kind = "quiet" if s.crowded(n) else ""
         time = Cell.time(o.seconds(phase), title=source(o), kind=kind)
-        shown = (*_series(s), _ranks(n, kind), iterations_cell(o), time)
-        if n == 1:
-            return (*shown, _ONE, _ONE)
         alone = s.answers[1]
+        ratios = (
+            (_ONE, _ONE)
+            if n == 1
+            else (
+                _ratio(s.speed_up(n, phase), source(alone, o), kind),
+                _ratio(s.efficiency(n, phase), source(alone, o), kind),
+            )
+        )
         return (
-            *shown,
-            _ratio(s.speed_up(n, phase), source(alone, o), kind),
-            _ratio(s.efficiency(n, phase), source(alone, o), kind),
+            *_series(s),
+            _ranks(n, kind),
+            iterations_cell(o),
+            Cell.number(o.counted("P_products"), "{:.0f}".format, title=source(o)),
+            time,
+            *ratios,
+            Cell.number(o.largest("peak_mib"), "{:.0f}".format, title=source(o)),
+            Cell.number(rank_memory(o), "{:.0f}".format, title=source(o)),
         )
 
     return Table(
@@ -105,9 +109,12 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
             *_SERIES,
             "ranks",
             "iterations",
+            "products",
             "time",
             "speed-up",
             "efficiency",
+            "peak, MiB",
+            "peak of a rank, MiB",
         ),
         rows=tuple(row(*each) for each in solves),
         text_columns=2,
@@ -142,60 +149,11 @@ def _weak_table(series: WeakSeries) -> Table:
     )  # fmt: skip
 
 
-def _part_tables(solves: Sequence[Solve]) -> Iterator[Table]:
-    """Tabulate the recorded times, messages and memory of the ranks."""
-    parts = [rank_parts(o) for *_, o in solves]
-    counts = [rank_counts(o) for *_, o in solves]
-    if any(parts):
-        names = dict.fromkeys(name for of in parts for name in of)
-        rows = []
-        for (s, n, o), of in zip(solves, parts, strict=True):
-            time = o.seconds("solve")
-            whole = Cell.number(time and time.value, significant, title=source(o))
-            spent = sum(part.mean for part in of.values())
-            rest = max(time.value - spent, 0.0) if time and of else None
-            shown = (_part(of.get(name), o) for name in names)
-            left = Cell.number(rest, significant)
-            rows.append((*_series(s), Cell.number(n), whole, *shown, left))
-        yield Table(
-            caption=TEXT("parts_caption"),
-            columns=(*_SERIES, "ranks", "solve", *names, "rest"),
-            rows=tuple(rows),
-            text_columns=2,
-            notes=(TEXT("parts_note"),),
-        )
-    if any(counts):
-        names = dict.fromkeys(name for of in counts for name in of)
-        yield Table(
-            caption=TEXT("sent_caption"),
-            columns=(*_SERIES, "ranks", *names, "peak, MiB"),
-            rows=tuple(
-                (
-                    *_series(s),
-                    Cell.number(n),
-                    *(_part(of.get(name), o) for name in names),
-                    _part(rank_memory(o), o),
-                )
-                for (s, n, o), of in zip(solves, counts, strict=True)
-            ),
-            text_columns=2,
-        )
-
-
-def _part(part: Part | None, o: Outcome) -> Cell:
-    if part is None:
-        return Cell()
-    text = f"{significant(part.mean)} [{significant(part.largest)}]"
-    return Cell(text=text, value=part.mean, title=source(o))
-
-
 def _pictures(
     strong: Sequence[StrongSeries], weak: Sequence[WeakSeries]
 ) -> Iterator[Picture]:
-    timed = [(s, n) for s in strong for n in s.several if rank_parts(s.answers[n])]
     drawn: tuple[tuple[str, Sequence[object], Callable[[], Figure]], ...] = (
         ("strong", strong, lambda: strong_figure(strong[:MOST_DRAWN])),
-        ("parts", timed, lambda: parts_figure(timed[: 3 * MOST_DRAWN])),
         ("weak", weak, lambda: weak_figure(weak[:MOST_DRAWN])),
     )
     for name, shown_series, draw in drawn:

@@ -306,7 +306,7 @@ class _Task:
     ) -> Vector:
         """Return d in the face with a small 𝒫(w − Fd − bent(d)), computed by CG.
 
-        With clusters or redundant rows, F is semidefinite, and directions that consist
+        With redundant rows, F is semidefinite, and directions that consist
         of rounding errors approach its kernel. Therefore the result is then d at the
         smallest wᵀMw if wᵀMw grows by MAX_GROWTH, which exact arithmetic excludes.
         """

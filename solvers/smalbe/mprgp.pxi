@@ -14,20 +14,12 @@ cdef double NOISE = 1e-13
 # these directions. Without this limit,
 # `test_rounding_along_previous_directions_is_removed` fails.
 cdef double MIN_SLOPE_RATIO = 0.5
-# For a semidefinite F, as in hybrid FETI and with redundant rows, CG is *spent* on a
-# face if φᵀz has fallen to the square of the rounding unit, relative to its largest
-# value, or if φᵀz or, after a sufficient decrease of φᵀz, the length of the CG step
-# exceeds its smallest value by the factor MAX_GROWTH. In exact arithmetic, the
-# condition number of MF on the range of F limits both factors, so such directions are
-# rounding errors. They approach the kernel of F, and x would grow without limit
-# (`test_a_semidefinite_dual_ends_at_its_rounding_errors`). For other F, the rules are
-# not used: with moduli 1 : 1e8, φᵀz legitimately falls by 38 orders of magnitude
-# (`test_rounding_along_previous_directions_is_removed`).
-cdef double MIN_DECREASE = 2.0 ** -104
+# For a semidefinite F, as with redundant rows, CG is *spent* on a face if φᵀz exceeds
+# its smallest value by this factor. In exact arithmetic, the condition number of MF on
+# the range of F limits this growth, so such directions are rounding errors. They
+# approach the kernel of F, and x would grow without limit
+# (`test_a_semidefinite_dual_ends_at_its_rounding_errors`).
 cdef double MAX_GROWTH = 1e6
-# x is stored at the smallest φᵀz if φᵀz has decreased by this factor on the face, so
-# that steps along spent directions can be undone.
-cdef double STORED_DECREASE = 2.0 ** -26
 
 cdef enum:
     # Largest number of CG directions stored for a face. Two passes over 200 directions
@@ -302,12 +294,7 @@ cdef class MPRGP:
     cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
     cdef double phi_square_at_refresh  # ‖φ‖² at the last `refresh` on this face
     cdef bint is_semidefinite  # True if F has a kernel
-    # smallest and largest φᵀz on this face, see `is_spent`
-    cdef double least_slope
-    cdef double most_slope
-    cdef double least_length  # smallest length of a CG step on this face
-    cdef double *best  # x at `least_slope`, if `has_best`
-    cdef bint has_best
+    cdef double least_slope  # smallest φᵀz on this face, see `is_spent`
     cdef Model B  # model of H; ᾱ = 1/τ is the length of gradient projection steps
     # model inverted on the face; None without preconditioning
     cdef Model preconditioner
@@ -334,7 +321,7 @@ cdef class MPRGP:
     cdef int make_room(self) except -1:
         """Allocate the vectors."""
         cdef Py_ssize_t n = self.n, r = self.rows.r
-        self.room = Room(18 * n + 3 * r)
+        self.room = Room(17 * n + 3 * r)
         cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -345,8 +332,7 @@ cdef class MPRGP:
         self.face_set = FeasibleSet.of(at, at + n, n, self.over)
         self.rhs, self.g0, self.marked = at + 2 * n, at + 3 * n, at + 4 * n
         self.x0 = self.z  # z is recomputed after each expansion
-        self.best = at + 5 * n
-        at += 6 * n
+        at += 5 * n
         self.Cv, self.Cw, self.Cx = at, at + r, at + 2 * r
         return 0
 
@@ -470,35 +456,20 @@ cdef class MPRGP:
         raise NotImplementedError
 
     cdef bint is_spent(self) noexcept:
-        """Return True if the CG direction of `line` consists of rounding errors.
-
-        `best` stores x at the smallest φᵀz, once φᵀz has decreased enough.
-        """
+        """Return True if the CG direction of `line` consists of rounding errors."""
         cdef double slope = fabs(self.line.slope)  # φᵀz, apart from rounding
         if not self.is_semidefinite or self.line.cg > self.line.feasible:
             return False
-        self.most_slope = fmax(self.most_slope, slope)
-        if slope < self.least_slope:
-            self.least_slope = slope
-            if slope <= STORED_DECREASE * self.most_slope:
-                self.has_best = True
-                memcpy(self.best, self.x, self.n * sizeof(double))
-        self.least_length = fmin(self.least_length, self.line.cg)
-        return (
-            slope > MAX_GROWTH * self.least_slope
-            or slope <= MIN_DECREASE * self.most_slope
-            or (self.has_best and self.line.cg > MAX_GROWTH * self.least_length)
-        )
+        self.least_slope = fmin(self.least_slope, slope)
+        return slope > MAX_GROWTH * self.least_slope
 
     cdef int refresh(self) except -1:
-        """Return to `best`, recompute the gradient from x and restart CG.
+        """Recompute the gradient from x and restart CG.
 
         Updates of the gradient retain rounding errors of its first, large values. The
         function takes one product. It returns 0, without a restart, if ‖φ‖ has not been
         halved since the last call.
         """
-        if self.has_best:
-            memcpy(self.x, self.best, self.n * sizeof(double))
         self.gradient(self.x, self.g)
         self.split()
         self.knows_Cx = False
@@ -545,8 +516,7 @@ cdef class MPRGP:
 
     cdef int first_direction(self) except -1:
         """Prepare the preconditioner for the face and set p to z."""
-        self.least_slope = self.least_length = INFINITY
-        self.most_slope, self.has_best = 0.0, False
+        self.least_slope = INFINITY
         if self.in_two:
             # φ is added later, in the pass that computes the product
             memset(self.p, 0, self.n * sizeof(double))

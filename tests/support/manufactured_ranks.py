@@ -16,10 +16,7 @@ from mortarbench.harness import Record, Verdict
 
 WORK, ALIKE = 4e-6, 0.02  #: shared work per dof, and repeated work of each rank, s
 SLOWDOWN = 1.25  #: factor by which simultaneous ranks slow each other down
-REDUCTIONS, MESSAGES, BYTES = 300, 100, 2e6
 PREPARED = 2e-6  #: time of preparation per dof, s; ranks share it completely
-#: fractions of the solve time by part
-SPENT = {"products": 0.5, "exchange": 0.05, "coarse": 0.15, "waiting": 0.2}
 
 
 def solve_seconds(dofs: int, ranks: int) -> float:
@@ -53,8 +50,6 @@ def rank_records(
 
 def _record(dofs, n, repeat, label, times):
     prepare, solve = map(float, times)
-    on_ranks = n > 1
-    counts = {"reductions": REDUCTIONS, "messages": MESSAGES, "bytes": BYTES}
     return Record(
         run_id=f"{dofs:06d}{n:02d}{repeat:02d}abcd",
         case=f"membranes/S={dofs // 1000}/dual", family="membranes",
@@ -64,13 +59,10 @@ def _record(dofs, n, repeat, label, times):
         sizes={"variables": dofs // 50, "equalities": 10, "inequalities": 0,
                "bounds": 10},
         reported={"rank_peak_mib_mean": 90.0, "rank_peak_mib_largest": 99.0}
-        if on_ranks else {},
+        if n > 1 else {},
         prepare_seconds=prepare, solve_seconds=solve, total_seconds=prepare + solve,
         peak_mib=100.0 * n, primal=1e-8, dual=1e-8, complementarity=1e-8, gap=1e-8,
         objective=-1.0, threads=1, cpu=0, ranks=n,
-        rank_seconds={name: (part * solve, 1.1 * part * solve)
-                      for name, part in SPENT.items()} if on_ranks else {},
-        rank_counts={name: (c, c) for name, c in counts.items()} if on_ranks else {},
         quantities={"dofs": dofs, "equality_rows": 10, "contact_rows": 10,
                     "subdomains": 64},
         environment="8c2f9a56e00f",

@@ -12,7 +12,6 @@ from mortarbench.harness.distributed.sparse import (
     CompressedRows,
     DirectSum,
     Identity,
-    Sum,
 )
 
 SEED = 1952
@@ -203,13 +202,3 @@ def test_a_row_with_many_entries_is_eliminated_late():
 
     assert L.entries <= 3 * 40
     assert L(np.ones(40)) == pytest.approx(np.linalg.solve(A.toarray(), np.ones(40)))
-
-
-def test_a_sum_adds_the_images_of_its_maps():
-    M = np.arange(6.0).reshape(2, 3)
-    total = Sum(*(CompressedRows(csr_array(k * M)) for k in (1, 2, 4)))
-
-    assert total(np.ones(3)).tolist() == (7 * M.sum(axis=1)).tolist()
-    assert total(np.eye(3)).tolist() == (7 * M).tolist()
-    with pytest.raises(ValueError, match="vector of 3 components; expected 2"):
-        Sum(CompressedRows(csr_array(M)), CompressedRows(csr_array(M.T)))

@@ -258,24 +258,6 @@ def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts)
     assert ranks.record.objective == pytest.approx(alone.record.objective, rel=1e-8)
 
 
-def test_records_contain_the_cost_of_each_rank(answers):
-    first, _ = answers
-    seconds, counts = first.record.rank_seconds, first.record.rank_counts
-
-    assert set(seconds) == {"products", "exchange", "coarse", "waiting"}
-    for mean, largest in [*seconds.values(), *counts.values()]:
-        assert 0 < mean <= largest
-    # the categories do not overlap, so their sum is at most the total time of a rank
-    assert sum(mean for mean, _ in seconds.values()) < first.record.solve_seconds
-    products = first.record.counts["P_products"]
-    applies = first.record.counts["preconditioner_applies"]
-    # messages to the only neighbour and back; messages of `prepare` are not counted
-    assert 0 <= 2 * (products + applies) - counts["messages"][0] <= 2 * LANCZOS
-    assert counts["bytes"][1] % 8 == 0
-    read = Record.from_json(first.record.to_json())
-    assert (read.rank_seconds, read.rank_counts) == (seconds, counts)
-
-
 @pytest.mark.slow  # `problems/feti/test_distributed.py` tests the refusal of the form
 def test_more_ranks_than_subdomains_are_declined():
     answer = mb.solve("membranes/S=1/n=2/dual", "smalbe", ranks=3)

@@ -18,7 +18,7 @@ from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.decomposed_bodies import decompose_by_labels, labelled
 
-GLUING = ("orthonormal", "chain", "redundant")
+GLUING = ("orthonormal", "redundant")
 BODIES = model(2, 2, 4, "strain")
 
 

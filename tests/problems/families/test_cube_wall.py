@@ -33,7 +33,7 @@ def solved(keys, solver):
         ("n=4/primal", "piqp"), ("n=4/primal", "clarabel"), ("n=4/dual", "smalbe"),
         ("n=4/dual", "piqp"), ("n=4/dual-bounds", "smalbe"),
         ("n=4/dual-bounds", "clarabel"), ("n=4/feti=2/dual", "smalbe"),
-        ("n=4/feti=1/glue=chain/dual", "smalbe"), ("n=4/feti=3/dual", "smalbe"),
+        ("n=4/feti=1/glue=redundant/dual", "smalbe"), ("n=4/feti=3/dual", "smalbe"),
         pytest.param("n=20/dual-bounds", "smalbe", marks=pytest.mark.slow),
         pytest.param("n=20/dual-bounds", "clarabel", marks=pytest.mark.slow),
         pytest.param("n=20/dual", "smalbe", marks=pytest.mark.slow),
@@ -104,7 +104,7 @@ def test_energies_fall_and_converge_with_smaller_cells():
     [
         ("n=0/dual", "n=0 must be at least 1"),
         ("n=4/feti=2/primal", "feti with form primal is not built"),
-        ("n=4/glue=chain/dual", "glue=chain is not used by feti=0"),
+        ("n=4/glue=redundant/dual", "glue=redundant is not used by feti=0"),
         ("n=4000/dual", "of memory; expected a mesh that fits"),
     ],
 )

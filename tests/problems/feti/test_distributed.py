@@ -155,10 +155,10 @@ def ranks_do_not_lock_one_another_out(monkeypatch):
     scope="module",
     params=[
         lambda: on_one_process(Membranes(2, 3).in_subdomains("redundant")).decomposed,
-        lambda: decomposed_pair("chain", most=4)[2],
+        lambda: decomposed_pair("redundant", most=4)[2],
         lambda: decomposed_pair("orthonormal", most=4)[2],
     ],
-    ids=["membranes", "chain", "orthonormal"],
+    ids=["membranes", "redundant", "orthonormal"],
 )
 def torn(request):
     return request.param()
@@ -286,7 +286,7 @@ def test_subdomains_are_weighted_by_dense_blocks_and_connected_by_rows(
 ):
     seen = {}
 
-    def noted(graph, work, size, ranks, cluster):
+    def noted(graph, work, size, ranks):
         seen.update(graph=graph.toarray(), work=work, size=size)
         return np.arange(size.size) % ranks
 

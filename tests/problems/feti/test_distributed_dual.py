@@ -20,7 +20,7 @@ DISCS = "contact-patch/lower=4/upper=3/friction=tresca/bound=1e5/feti=2/dim=3/du
 CASES = (
     "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual",
     "beam-ring/Nr=5/Nh=3/steps=1/feti=3/glue=redundant/friction=tresca/bound=1e5/dual",
-    "contact-patch/feti=3/slave=upper/ratio=5/glue=chain/dual",
+    "contact-patch/feti=3/slave=upper/ratio=5/dual",
     "membranes/S=2/n=3/dual",
     "plate/Sx=3/Sy=2/n=3/ny=2/pattern=checkerboard/jump=10/load=edge/dual",
     "plate/Sx=3/Sy=3/n=3/ny=2/pattern=column/jump=10/supports=eliminated/dual",
@@ -33,12 +33,10 @@ CASES = (
     "plate/Sx=2/Sy=2/n=2/pattern=checkerboard/jump=10/dim=3/Sz=2/dual",
     "contact-patch/lower=3/upper=2/feti=2/dim=3/distort=0.2/dual",
     DISCS,
-    "beam-ring/Nr=3/Nh=2/steps=1/feti=2/glue=redundant/cluster=2/dual",
-    "plate/Sx=4/Sy=4/n=2/pattern=column/jump=10/cluster=2/dual",
 )
-#: cases of the default tests: each family of CASES, each gluing, friction, clusters,
-#: and three-dimensional bodies
-QUICK = (*CASES[1:4], CASES[5], *CASES[8:12], DISCS, CASES[16])
+#: cases of the default tests: each family of CASES, each gluing, friction, and
+#: three-dimensional bodies
+QUICK = (*CASES[1:4], CASES[5], *CASES[8:12], DISCS)
 ALL_CASES = [
     pytest.param(case, marks=[pytest.mark.slow] * (case not in QUICK)) for case in CASES
 ]
@@ -51,12 +49,12 @@ LATER = (
     "contact=mortar/feti=2/dual",
     "contact-patch/ratio=5/friction=coulomb/mu=0.3/glue=redundant/feti=3/dual",
     "hertz-cylinder/n=1/m=1/friction=coulomb/mu=0.3/Q=0.2/peak=0.6/feti=9/dual",
-    "greco/n=7/mu=0.4/iterate=2/glue=chain/feti=2/dual",
+    "greco/n=7/mu=0.4/iterate=2/feti=2/dual",
     "greco/n=4/dim=3/depth=2/feti=2/dual",
 )
 #: case in which an active set method alone cycles (`solvers.reference.over_ranks`)
 CIRCLES = (
-    "beam-ring/Nr=1/Nh=3/radial=6/steps=2/relin=2/feti=7/glue=chain/contact=mortar/"
+    "beam-ring/Nr=1/Nh=3/radial=6/steps=2/relin=2/feti=7/contact=mortar/"
     "friction=coulomb/mu=0.3/loading=static/dual"
 )
 COUPLING_ROUNDING = 1e-14
@@ -195,7 +193,7 @@ def generated(rng, count=8):
     """Yield names of small cases with blocks of all shapes and at least three
     subdomains."""
     for _ in range(count):
-        glue = rng.choice(["orthonormal", "chain", "redundant"])
+        glue = rng.choice(["orthonormal", "redundant"])
         law = rng.choice(["", "/friction=tresca/bound=1e5"])
         contact = rng.choice(["nts", "mortar"])
         method = f"glue={glue}/contact={contact}{law}/dual"
@@ -246,7 +244,7 @@ def generated_with_coulomb_s_law(rng, count=3):
     """
     for _ in range(count):
         method = (
-            f"glue={rng.choice(['orthonormal', 'chain', 'redundant'])}/"
+            f"glue={rng.choice(['orthonormal', 'redundant'])}/"
             f"contact={rng.choice(['nts', 'mortar'])}/"
             f"loading={rng.choice(['quasi-static', 'static'])}/"
             f"friction=coulomb/mu={rng.choice([0.05, 0.3, 0.6])}/dual"

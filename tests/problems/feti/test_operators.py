@@ -27,7 +27,7 @@ from tests.support.decomposed_bodies import decompose_by_labels, labelled
 
 pytestmark = pytest.mark.together
 
-GLUING = ("orthonormal", "chain", "redundant")
+GLUING = ("orthonormal", "redundant")
 SCALINGS = ("multiplicity", "stiffness")
 KINDS = ("lumped", "dirichlet")
 

@@ -27,7 +27,7 @@ from mortarbench.problems.feti.tearing import (
 from tests.support.decomposed_bodies import decomposed_pair
 from tests.support.glued import decompose, glue, structured_bodies
 
-GLUING = ("orthonormal", "chain", "redundant")
+GLUING = ("orthonormal", "redundant")
 
 
 def test_blocks_are_as_equal_as_whole_numbers_allow() -> None:

@@ -71,7 +71,7 @@ def test_a_route_has_its_fastest_solver_at_each_size(evidence):
     assert one.sizes == (1000, 2000, 4000, 8000)
     assert [o.solver for o in one.routes[PRIMAL].values()] == ["a", "a", "a", "b"]
     assert set(one.routes) == {PRIMAL, DUAL, TFETI, RANKS}
-    assert one.missing == ("primal, multigrid", "dual-bounds", "hybrid TFETI")
+    assert one.missing == ("primal, multigrid", "dual-bounds")
 
 
 def test_memory_is_the_larger_peak_of_building_and_solving(evidence):
@@ -119,7 +119,7 @@ def test_the_section_names_every_route_even_those_without_measurements(evidence)
     stops = whole.tables[-1]
     assert [row[0].text for row in stops.rows] == [
         "primal", "dual", "TFETI (feti=4)", "TFETI (feti=4), 2 ranks",
-        "primal, multigrid", "dual-bounds", "hybrid TFETI",
+        "primal, multigrid", "dual-bounds",
     ]  # fmt: skip
     assert [row[3].text for row in stops.rows][2:5] == [
         "memory limit", "not measured", "not in this run"
@@ -137,7 +137,7 @@ def test_a_route_that_all_solvers_declined_differs_from_one_not_measured(evidenc
 
     why = {row[0].text: row[3].text for row in whole.tables[-1].rows}
     assert why["dual-bounds"] == "declined by all solvers"
-    assert why["hybrid TFETI"] == "not in this run"
+    assert why["primal, multigrid"] == "not in this run"
 
 
 def test_a_folder_without_growing_series_has_no_section(evidence):

@@ -7,9 +7,7 @@ import pytest
 from mortarbench.harness import Verdict
 from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.data.rank_series import (
-    rank_counts,
     rank_memory,
-    rank_parts,
     strong_series,
     weak_series,
 )
@@ -17,9 +15,7 @@ from mortarbench.reports.folder import compose
 from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.ranks import ranks
 from tests.support.manufactured_ranks import (
-    BYTES,
     SLOWDOWN,
-    SPENT,
     rank_records,
     solve_seconds,
 )
@@ -101,14 +97,14 @@ def test_answers_that_were_not_verified_are_left_out():
     assert tuple(series.answers) == (1, 4)
 
 
-def test_parts_are_medians_of_means_and_of_the_largest(strong):
-    parts, whole = rank_parts(strong.answers[2]), solve_seconds(DOFS, 2)
-    assert {k: p.mean / whole for k, p in parts.items()} == pytest.approx(SPENT)
-    assert parts["coarse"].largest == pytest.approx(1.1 * parts["coarse"].mean)
-    assert rank_counts(strong.answers[2])["bytes"].mean == BYTES
-    assert rank_memory(strong.answers[2]) == (90.0, 99.0)
-    assert rank_parts(strong.answers[1]) == {}
+def test_the_section_shows_products_and_memory(strong, manufactured):
+    assert rank_memory(strong.answers[2]) == 99.0
     assert rank_memory(strong.answers[1]) is None
+    _, solve, *_ = ranks(Analysis(manufactured)).tables
+    shown = [dict(zip(solve.columns, row, strict=True)) for row in solve.rows]
+    assert {row["products"].text for row in shown} == {"24"}
+    assert [row["peak, MiB"].value for row in shown[:3]] == [100.0, 200.0, 400.0]
+    assert [row["peak of a rank, MiB"].text for row in shown[:3]] == ["–", "99", "99"]
 
 
 def test_a_report_without_ranks_states_the_requirements(manufactured):
