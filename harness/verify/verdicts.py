@@ -45,7 +45,6 @@ from mortarbench.harness.verify.kkt import (
     scaling_of,
     verdict,
 )
-from mortarbench.harness.verify.over_ranks import certify_over_ranks
 
 #: Version of the data from which a run_id is computed, independent of the schema of
 #: records.
@@ -210,8 +209,8 @@ def evaluated_by_ranks(
     Returns
     -------
     a dict with `values`: objective and residuals, or None if they are not finite or
-    require the whole QP; `bounds`: fields of `certified`, or None if they require the
-    whole QP; `quantities`: physical quantities, or None if they require the whole QP;
+    require the whole QP; `bounds`: None, since a certificate requires the whole QP;
+    `quantities`: physical quantities, or None if they require the whole QP;
     `recover_seconds`: time to evaluate the quantities; `notes`: reasons of failures.
     After a failure, the values concerned are None or empty. If `values` is None, all
     values are None
@@ -233,11 +232,6 @@ def evaluated_by_ranks(
         answered = run_collectively(ranks, lambda: emitted.answer(s))
     except Exception as e:
         return {**found, "notes": [note_of("evaluation by ranks", e)]}
-    if (certifiable := answered.certifiable) is not None:
-        found["bounds"], note = _certified(
-            lambda: run_collectively(ranks, lambda: certify_over_ranks(*certifiable))
-        )
-        found["notes"] += filter(None, [note])
     if (results := answered.quantities) is not None:
         start = perf_counter()
         try:

@@ -43,12 +43,12 @@ from mortarbench.problems.duality.problem import (
 )
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import Mesh, Nodes
-from mortarbench.problems.feti.local_bodies import certifier
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
     on_one_process,
 )
+from mortarbench.problems.feti.substructures import decomposed_mechanics
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -175,11 +175,11 @@ def contact_case(
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, certify_by_subdomains, subdomains = None, None, None
+    seconds, mechanics, subdomains = None, None, None
     if parts is not None:
         start = perf_counter()
         local = on_one_process(parts)
-        decomposed, certify_by_subdomains = local.decomposed, certifier(local, primal.P)
+        decomposed, mechanics = local.decomposed, decomposed_mechanics(local, primal.P)
         transformed = feti_dual(decomposed, primal, friction)
         seconds = perf_counter() - start
         subdomains = parts.layout.label
@@ -240,7 +240,7 @@ def contact_case(
             ),
             friction=friction,
             # subdomains are certified for supports with u = 0
-            certify_by_subdomains=None if has_lift else certify_by_subdomains,
+            subdomains=None if has_lift else mechanics,
         ),
         unsettled=friction.unsettled,
     )

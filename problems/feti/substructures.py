@@ -1,18 +1,30 @@
-"""Local problems of subdomains for certificates: stiffness, kernel and inverse."""
+"""Decomposed bodies for certificates: local problems, contact and rigid motions."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, csr_array
+from scipy.linalg import null_space
+from scipy.sparse import bsr_array, csc_array, csr_array, hstack
 
 from mortarbench.harness import Vector
+from mortarbench.harness.mechanics import (
+    DecomposedMechanics,
+    Real,
+    contact_data,
+    friction_discs,
+)
 from mortarbench.harness.verify.products import projected_products
+from mortarbench.problems.fem.elasticity import rigid_modes, rigid_motions
+from mortarbench.problems.fem.mesh import dofs_of
+from mortarbench.problems.feti.subdivision import Points
 from mortarbench.problems.feti.subdomain_classes import DecomposedBodies, SubdomainClass
+from mortarbench.problems.feti.subdomains import DecomposedProblem, LocalSubdomains
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,3 +126,83 @@ def _nodal(template: SubdomainClass, d: int) -> NDArray[np.float64]:
     for i, j in np.ndindex(d, d):
         blocks[:, i, j] = template.K.diagonal(j - i)[min(i, j) :: d]
     return blocks
+
+
+def decomposed_mechanics(
+    local: LocalSubdomains, K: csc_array | None = None
+) -> Callable[[], DecomposedMechanics]:
+    """Return a function that returns the decomposed bodies, for certificates.
+
+    K : (n, n) stiffness matrix of the undivided bodies; None if it is not assembled
+    """
+
+    @cache
+    def bodies() -> DecomposedMechanics:
+        floating = local.floating  # supports are rows of B
+        problem, contact = floating.problem, floating.problem.contact
+        n, m = problem.components * problem.layout.nodes, contact.c.size
+        bound = contact.bound
+        acts = np.append(np.ones(m - bound.size), bound) > 0
+        rows, diagonal = csr_array(contact.rows[acts]), np.zeros(n)
+        at = np.unique(rows.indices)
+        parts = LocalProblems(floating.decomposed, problem.components)
+        diagonal[at] = parts.diagonal(at)
+        return DecomposedMechanics(
+            parts=parts,
+            exact=contact_data(
+                problem.load(np.arange(n)).astype(Real),
+                (rows, contact.c[acts]),
+                friction_discs(bound[bound > 0], contact.tangents, m - bound.size),
+                np.unique(problem.fixed),
+                diagonal,
+            ),
+            stored=None if K is None else csr_array(K),
+            **_rigid_motions(problem),
+        )
+
+    return bodies
+
+
+def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
+    """Return the fields of `DecomposedMechanics` that describe rigid motions."""
+    layout, d, names = problem.layout, problem.components, list[str]()
+    node, axis = np.divmod(problem.fixed, d)
+    body = problem.piece_of[layout.holder(node)]
+    none = csr_array((d * layout.nodes, 0))
+    kernel, rigid = [none], [none]
+    for b, name in enumerate(problem.names):
+        fixed, axes = node[body == b], axis[body == b]
+        if _prevents_motion(layout.position(fixed), axes, d):
+            continue
+        nodes = layout.subdomain_nodes(np.arange(layout.count))
+        of_body = np.unique(nodes.number[problem.piece_of[nodes.subdomain] == b])
+        points, dofs = layout.position(of_body), dofs_of(of_body, d)
+        R = (
+            rigid_modes(points)
+            if d > 1
+            else np.full((len(points), 1), len(points) ** -0.5)
+        )
+        at = d * np.searchsorted(of_body, fixed) + axes
+        allowed = R @ null_space(R[at]) if at.size else R.copy()
+        allowed[at] = 0
+        embedding = csr_array(
+            (np.ones(dofs.size), (dofs, np.arange(dofs.size))),
+            shape=(d * layout.nodes, dofs.size),
+        )
+        rigid.append(embedding @ csr_array(R))
+        kernel.append(embedding @ csr_array(allowed))
+        names.append(name)
+    return {
+        "kernel": csr_array(hstack(kernel)),
+        "rigid": csr_array(hstack(rigid)),
+        "names": tuple(names),
+    }
+
+
+def _prevents_motion(points: Points, axes: NDArray[np.int64], d: int) -> bool:
+    """Return True if no rigid motion is zero along `axes[i]` at all points i."""
+    if d == 1 or not len(points):
+        return len(points) > 0
+    size = np.ptp(points, axis=0).max() or 1.0
+    R = rigid_motions(points / size)[d * np.arange(axes.size) + axes]
+    return bool(np.linalg.matrix_rank(R) == R.shape[1])

@@ -45,7 +45,7 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
@@ -53,6 +53,7 @@ from mortarbench.problems.feti.subdomains import (
     DecomposedProblem,
     on_one_process,
 )
+from mortarbench.problems.feti.substructures import decomposed_mechanics
 from mortarbench.problems.feti.tearing import SubdomainMesh
 
 NAMES = ("left", "right")
@@ -66,13 +67,13 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     pair = Membranes(p["S"], p["n"])
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, certify_by_subdomains = None, None
+    seconds, subdomains = None, None
     if form == "primal":
         new = primal_form(pair.qp)
     else:
         start = perf_counter()
         own = on_one_process(pair.in_subdomains(p["glue"], p["cluster"]))
-        pieces, certify_by_subdomains = own.decomposed, certifier(own, pair.qp.P)
+        pieces, subdomains = own.decomposed, decomposed_mechanics(own, pair.qp.P)
         new = feti_dual(pieces, pair.qp)
         seconds = perf_counter() - start
         matrices = feti_matrices(pieces, new.qp)
@@ -94,7 +95,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
             rigid=pair.rigid,
             names=NAMES,
             grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
-            certify_by_subdomains=certify_by_subdomains,
+            subdomains=subdomains,
         ),
     )
 

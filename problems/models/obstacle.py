@@ -59,7 +59,7 @@ from mortarbench.problems.fem.inverse import (
 from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid
 from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import mesh_in_subdomains
 from mortarbench.problems.feti.subdomains import (
@@ -67,6 +67,7 @@ from mortarbench.problems.feti.subdomains import (
     DecomposedProblem,
     on_one_process,
 )
+from mortarbench.problems.feti.substructures import decomposed_mechanics
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.membranes import membrane_class
 
@@ -87,13 +88,13 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
             f"feti with form {form} is not built; expected form dual, or no feti"
         )
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
-    rows, start, certify_by_subdomains = problem.qp, perf_counter(), None
+    rows, start, subdomains = problem.qp, perf_counter(), None
     decomposition: Mapping[str, Any] = {}
     if form == "primal":
         new = bound_form(rows)
     elif p["feti"]:
         own = on_one_process(in_subdomains(params))
-        pieces, certify_by_subdomains = own.decomposed, certifier(own, rows.P)
+        pieces, subdomains = own.decomposed, decomposed_mechanics(own, rows.P)
         new = feti_dual(pieces, rows)
         decomposition = decomposition_quantities(pieces, new.qp)
     elif form == "dual":
@@ -118,7 +119,7 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
             factorise=problem.factorise,
             mesh_size=2 * HALF[p["shape"]] / p["n"],
             rigid=np.zeros((rows.q.size, 0)),
-            certify_by_subdomains=certify_by_subdomains,
+            subdomains=subdomains,
             constant=datum,
             grid=Grid(
                 problem.x,

@@ -72,7 +72,7 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
     spectra_over_ranks,
@@ -86,6 +86,7 @@ from mortarbench.problems.feti.subdomains import (
     LocalSubdomains,
     on_one_process,
 )
+from mortarbench.problems.feti.substructures import decomposed_mechanics
 from mortarbench.problems.feti.tearing import blocks, grid_positions
 
 LENGTH = 1.0  #: l, unit of length, m
@@ -139,8 +140,10 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
                 np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
-            certify_by_subdomains=(
-                certifier(plate.own, plate.primal.P) if form == "dual" else None
+            subdomains=(
+                decomposed_mechanics(plate.own, plate.primal.P)
+                if form == "dual"
+                else None
             ),
         ),
     )
