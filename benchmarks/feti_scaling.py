@@ -48,7 +48,6 @@ from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.duality.feti_dual import feti_dual
 from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import certifier
 from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.spectrum import spectra_over_ranks
 from mortarbench.problems.feti.subdomains import Contact, on_one_process
@@ -93,13 +92,13 @@ def one(way, family, size, cells):
     rows = problem.linearise(bodies, stage.laws)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
     lap()
-    pieces = certify_by_subdomains = parts = None
+    pieces = subdomains = parts = None
     if way == "feti":
         contact = Contact(csr_array(primal.G), primal.h, np.zeros(0))
         layout = of.shape.layout(cells)
         parts = decompose(of, layout, "orthonormal", stage, contact)
         own = on_one_process(parts)
-        pieces, certify_by_subdomains = own.decomposed, certifier(own, primal.P)
+        pieces, subdomains = own.decomposed, decomposed_mechanics(own, primal.P)
         dual = feti_dual(pieces, primal)
     else:
         dual = dualise(primal, factorise_floating(bodies))
@@ -113,7 +112,7 @@ def one(way, family, size, cells):
     mechanics = Mechanics(
         primal=primal, to_primal=dual.recover,
         factorise=lambda: factorise_clamped(bodies),
-        certify_by_subdomains=certify_by_subdomains,
+        subdomains=subdomains,
         mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip
     bound = certify(mechanics, back).bound

@@ -357,7 +357,12 @@ class Exact(NamedTuple):
     c: Extended  #: (m,) right-hand side: initial gaps, then the `start` of friction
     forces: AdmissibleForces  #: set Λ of admissible multipliers
     fixed: NDArray[np.int64]  #: numbers of the prescribed components
-    compliance: Extended  #: (m,) estimate B_i diag(K)⁻¹ B_iᵀ for each row B_i
+    softness: Vector  #: (n,) 1/Kᵢᵢ, zero at prescribed components
+
+    @property
+    def compliance(self) -> Extended:
+        """Estimate (m,) B_i diag(K)⁻¹ B_iᵀ of the compliance of each row B_i."""
+        return np.asarray(self.B.multiply(self.B) @ self.softness)
 
     @property
     def contact(self) -> NDArray[np.bool_]:
@@ -396,22 +401,95 @@ class Exact(NamedTuple):
         return -multipliers[contact] * motion[contact], work
 
 
-class RigidMotions(NamedTuple):
-    """Rigid motions that the supports allow, split into constrained and free motions.
+def contact_data(
+    f: Extended,
+    rows: tuple[Any, NDArray[Any]],
+    discs: Discs,
+    fixed: NDArray[np.int64],
+    diagonal: Vector,
+) -> Exact:
+    """Return the data of a contact problem.
 
-    Constrained motions change contact gaps or slip; free motions do not. Columns are
-    orthonormal in extended precision. K·constrained is zero except for rounding errors,
-    which are relevant if bodies move far; see `harness.verify.certificate`.
+    Parameters
+    ----------
+    f : (n,) load
+    rows : B (m, n) and c (m,) of contact, followed by friction with positive bounds
+    discs : discs of the multipliers of friction
+    fixed : prescribed components
+    diagonal : (n,) diagonal of K, at least at the components that occur in rows
+
+    """
+    B, c = (v.astype(Real) for v in rows)
+    softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
+    softness[fixed] = 0
+    return Exact(
+        f=f,
+        B=B,
+        c=c,
+        forces=AdmissibleForces(c.size, discs),
+        fixed=fixed,
+        softness=softness,
+    )
+
+
+class RigidMotions(NamedTuple):
+    """Rigid motions R that the supports allow: constrained motions, then free motions.
+
+    Constrained motions change contact gaps or slip; free motions change them only by
+    rounding. Columns are orthonormal in extended precision. K·constrained is zero
+    except for rounding errors, which are relevant if bodies move far; see
+    `harness.verify.certificate`.
     """
 
-    constrained: Any  #: (n, p) sparse matrix of the motions that change gaps or slip
-    #: (n, q) sparse matrix of the motions that change gaps and slip only by rounding
-    free: Any
+    all: Any  #: R (n, r), sparse
     G: Extended  #: (m, p) product B·constrained
     #: (n, p) `constrained` with each nonzero replaced by the largest absolute value of
     #: its column
     largest: Any
-    KR: Extended  #: (n, p) product K·constrained, zero on prescribed components
+    #: (n, p) product K·constrained, zero on prescribed components; zero if unknown
+    KR: Any
+
+    @property
+    def constrained(self) -> Any:
+        """Motions that change gaps or slip, (n, p)."""
+        return self.all[:, : self.G.shape[1]]
+
+    @property
+    def free(self) -> Any:
+        """Motions that do not change gaps or slip, (n, r − p)."""
+        return self.all[:, self.G.shape[1] :]
+
+    def along(self, v: Extended) -> Extended:
+        """Return the coefficients Rᵀv (r,)."""
+        # products with empty sparse matrices are slow
+        return np.asarray(self.all.T @ v) if self.all.shape[1] else v[:0]
+
+    def without(self, v: Extended) -> Extended:
+        """Return v − RRᵀv (n,)."""
+        return np.asarray(v - self.all @ self.along(v)) if self.all.shape[1] else v
+
+
+def rigid_motions(exact: Exact, R: csr_array, K: csr_array | None) -> RigidMotions:
+    """Split the span of R (n, r), orthonormal to double precision, by the rows of B.
+
+    K : (n, n) stored stiffness matrix; None if it is not assembled
+    """
+    at = np.unique(exact.B.indices)
+    B = exact.B[:, at].astype(np.float64)
+    turn, p = constrained_first(B, R[at].toarray())
+    R = _orthonormal(R if p == R.shape[1] else csr_array(R @ csr_array(turn)))
+    constrained = R[:, :p]
+    if K is None:
+        KR: Any = csr_array(constrained.shape, dtype=Real)
+    else:
+        KR = cancelling(K, constrained.toarray()) if p else np.zeros(constrained.shape)
+        KR[exact.fixed] = 0
+    return RigidMotions(
+        all=R,
+        G=np.asarray((exact.B @ constrained).toarray()),
+        largest=_largest(constrained),
+        KR=KR,
+    )
 
 
 #: Names of first-order cells in meshio, by dimension and number of corners.
@@ -563,9 +641,8 @@ class Mechanics:
     #: `harness.crossval.discretisation`
     grid: Grid | None = None
     friction: Friction = NO_FRICTION
-    #: returns the `Certificate` of a displacement (n,) and the multipliers (m,) of
-    #: `rows`, computed for each subdomain, without factorising the assembled K
-    certify_by_subdomains: Callable[[Vector, Vector], Any] | None = None
+    #: returns the decomposed bodies, for certificates without factorising K
+    subdomains: Callable[[], DecomposedMechanics] | None = None
 
     @cached_property
     def rows(self) -> csr_array:
@@ -595,24 +672,17 @@ class Mechanics:
     @cached_property
     def exact(self) -> Exact:
         """The data of the problem except K, in extended precision."""
-        diagonal, B = self.primal.P.diagonal(), self.rows
-        c = contact_rows(self.primal, self._active_friction)[1]
-        fixed = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
-        softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
-        softness[fixed] = 0
-        f, gaps, rows = -self.primal.q.astype(Real), c.astype(Real), B.astype(Real)
+        B, c = contact_rows(self.primal, self._active_friction)
+        f, c = -self.primal.q.astype(Real), c.astype(Real)
         if self.lift.any():
             f = f - self.stiffness @ self.lift
-            gaps = gaps - rows @ self.lift
-        return Exact(
-            f=f,
-            B=rows,
-            c=gaps,
-            fixed=fixed,
-            forces=AdmissibleForces(
-                c.size, self._active_friction.discs(self.primal.h.size)
-            ),
-            compliance=(B.multiply(B) @ softness).astype(Real),
+            c = c - B.astype(Real) @ self.lift
+        return contact_data(
+            f,
+            (B, c),
+            self._active_friction.discs(self.primal.h.size),
+            np.unique(csr_array(self.primal.A).indices).astype(np.int64),
+            self.primal.P.diagonal(),
         )
 
     @cached_property
@@ -628,11 +698,7 @@ class Mechanics:
     @cached_property
     def whole(self) -> Mechanics:
         """The same problem, with certificates from the assembled K."""
-        return (
-            self
-            if self.certify_by_subdomains is None
-            else replace(self, certify_by_subdomains=None)
-        )
+        return self if self.subdomains is None else replace(self, subdomains=None)
 
     def energy(self, u: Extended) -> float:
         """Return the potential energy of `u` (n,), including friction, in SI units.
@@ -643,35 +709,21 @@ class Mechanics:
         objective = objective + self.exact.friction_work(u).sum()
         return float(self.scale * objective + self.constant)
 
-    @cached_property
+    @property
     def kernel(self) -> Any:
         """Rigid motions (n, r) that the supports allow, in extended precision."""
-        return _orthonormal(self.inverse.kernel)
+        return self.motions.all
 
     @cached_property
     def motions(self) -> RigidMotions:
         """Rigid motions that the supports allow, as constrained and free motions."""
-        exact, B, R = self.exact, self.rows, self.inverse.kernel
-        turn, p = constrained_first(B, R)
-        turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
-        constrained = turned[:, :p]
-        KR = np.zeros(constrained.shape, dtype=Real)
-        if p:
-            KR = cancelling(csr_array(self.primal.P), np.asarray(constrained.toarray()))
-            KR[exact.fixed] = 0
-        return RigidMotions(
-            constrained=constrained,
-            free=turned[:, p:],
-            G=np.asarray((exact.B @ constrained).toarray()),
-            largest=_largest(constrained),
-            KR=KR,
+        return rigid_motions(
+            self.exact, csr_array(self.inverse.kernel), csr_array(self.primal.P)
         )
 
     def without_rigid_motion(self, v: Extended) -> Extended:
         """Return v − RRᵀv (n,), where R is `kernel`."""
-        if not self.kernel.shape[1]:  # products with empty sparse matrices are slow
-            return v
-        return np.asarray(v - self.kernel @ (self.kernel.T @ v))
+        return self.motions.without(v)
 
     def apply_inverse(self, force: Extended) -> Extended:
         """Apply PK⁺P to a force (n,), where P = I − RRᵀ and R is `kernel`."""
@@ -689,13 +741,37 @@ class Mechanics:
         return float(np.sqrt(max(v @ (self.stiffness @ v), Real(0))))
 
 
-def _orthonormal(R: NDArray[np.float64]) -> Any:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DecomposedMechanics:
+    """Elastic contact problem of decomposed bodies, for certificates.
+
+    The stiffness is K = Tᵀ PDP T (`Substructures`) up to rounding.
+    """
+
+    parts: Substructures
+    exact: Exact  #: data of the problem except K
+    kernel: csr_array  #: (n, r) orthonormal rigid motions that the supports allow
+    #: (n, k) orthonormal rigid motions, regardless of supports, of the bodies that can
+    #: move rigidly
+    rigid: csr_array
+    names: tuple[str, ...]  #: names of these bodies
+    #: (n, n) assembled K, whose rounding affects the error if an answer moves bodies
+    #: together with their supports; None if it is not assembled
+    stored: csr_array | None = None
+
+    @cached_property
+    def motions(self) -> RigidMotions:
+        """Rigid motions that the supports allow, as constrained and free motions."""
+        return rigid_motions(self.exact, self.kernel, None)
+
+
+def _orthonormal(R: csr_array) -> Any:
     """Orthonormalise the columns of R (n, r) in extended precision, as a sparse matrix.
 
     On entry, R is orthonormal to double precision. The step R + R(I − RᵀR)/2 squares
     the error of RᵀR = I.
     """
-    Q = csr_array(R.astype(Real))
+    Q = R.astype(Real)
     return csr_array(Q + Q @ (0.5 * (eye_array(R.shape[1]) - Q.T @ Q)))
 
 

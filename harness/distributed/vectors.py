@@ -376,9 +376,6 @@ DISTRIBUTED_DIGEST = "emitted-"
 class Evaluation(NamedTuple):
     """Evaluation of a solution that is distributed over ranks."""
 
-    #: arguments of `certify_over_ranks` (`harness.verify.over_ranks`); None if a
-    #: certificate needs the whole QP
-    certifiable: Any | None
     #: function, called by all ranks, that returns the physical results in SI units,
     #: equal on all ranks; None if the results need the whole QP
     quantities: Callable[[], Mapping[str, Any]] | None

@@ -7,26 +7,20 @@ are therefore computed simultaneously for a set of rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import (
-    csc_array,
-    csc_matrix,
-    csr_array,
-    diags_array,
-    eye_array,
-    hstack,
-)
+from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from mortarbench.harness.mechanics import (
     MOTION_ROUNDING,
     AdmissibleForces,
+    DecomposedMechanics,
     Exact,
     Extended,
     Mechanics,
@@ -55,87 +49,70 @@ class UncertifiableError(Exception):
 
 
 def admissible(
-    mechanics: Mechanics, u: Extended, closed: NDArray[np.bool_]
+    bodies: Mechanics | DecomposedMechanics, u: Extended, closed: NDArray[np.bool_]
 ) -> Extended | None:
     """Return û near u with Bû ≤ c and equality on the rows `closed`; None on failure.
 
-    û is the point nearest to u in the energy norm that satisfies a set V of rows with
-    equality: û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα. Here, F_VV = B_V
-    K⁺B_Vᵀ is the compliance of the rows, and the columns of R are rigid motions. V
-    initially consists of the closed and the violated rows and is extended until Bû ≤ c.
-    If this fails and c ≥ 0, û = θu with θ ≤ 1, without equality on the closed rows. The
-    inequalities hold for contact rows only. Free motions are first removed from u.
+    û is the point nearest to u that satisfies a set V of rows with equality. The
+    inequalities hold for contact rows only. V initially consists of the closed and the
+    violated rows and is extended until Bû ≤ c. If this fails and c ≥ 0, û = θu with θ ≤
+    1, without equality on the closed rows. Free motions are first removed from u.
     """
-    exact, moving = mechanics.exact, mechanics.motions
-    if moving.free.shape[1]:
-        u = u - moving.free @ (moving.free.T @ u)
-    rows = _Rows(exact.B, exact.c, exact.contact)
-    point = _feasible_near(rows, u, closed, partial(_nearest, mechanics))
-    return None if point is None else point.u
-
-
-class _Rows(NamedTuple):
-    """Contact rows Bu ≤ c, and friction rows, which do not constrain u."""
-
-    B: Any  #: (m, n) rows in extended precision
-    c: Extended  #: (m,) right-hand sides
-    contact: NDArray[np.bool_]  #: (m,) mask of the contact rows
-
-
-class FeasiblePoint(NamedTuple):
-    """A displacement that satisfies all contact rows."""
-
-    u: Extended
-    theta: Any = Real(1)  #: factor θ ≤ 1 by which the displacement was scaled
+    free = bodies.motions.free
+    if free.shape[1]:
+        u = u - free @ (free.T @ u)
+    if isinstance(bodies, Mechanics):
+        nearest = partial(_nearest_in_energy, bodies)
+    else:
+        nearest = partial(_nearest_at_rows, bodies.exact, bodies.motions.constrained)
+    return _feasible_near(bodies.exact, u, closed, nearest)
 
 
 def _feasible_near(
-    rows: _Rows,
+    exact: Exact,
     u: Extended,
     closed: NDArray[np.bool_],
-    nearest: Callable[[NDArray[np.bool_]], Callable[[Vector], Vector]],
-) -> FeasiblePoint | None:
+    nearest: Callable[[NDArray[np.bool_]], Callable[[Vector], Extended]],
+) -> Extended | None:
     """Move u into the feasible set, with equality on the rows V.
 
-    V initially consists of the closed and the violated rows; contact rows that become
-    violated after a correction are added. The target of a correction is a few units in
-    the last place inside the feasible set, so that rounding of Bu cannot hide a
-    violation. If MAX_ROUNDS corrections do not suffice or overflow, a feasible θu with
-    θ ≤ 1 is returned if c ≥ 0, and otherwise None. Friction rows belong to V only if
-    they are closed, that is, if they stick.
+    The target of a correction is a few units in the last place inside the feasible set,
+    so that rounding of Bu cannot hide a violation. If MAX_ROUNDS corrections do not
+    suffice or overflow, the result is that of `_shrunk`. Friction rows belong to V only
+    if they are closed, that is, if they stick.
 
     nearest : returns, for rows V, the map from violations t (v,) to a
-        correction δ with B_V δ = −t
+        correction δ (n,) with B_V δ = −t
     """
-    B, c, contact = rows
+    B, c, contact = exact.B, exact.c, exact.contact
+    at = np.unique(B.indices)
     enforced = np.zeros_like(closed)
     moved, step = u, None
     for _ in range(MAX_ROUNDS):
         gap = c - B @ moved
-        size = np.abs(moved).max(initial=Real(0))  # bounds the terms of the correction
-        reach = abs(B) @ (16 * np.abs(moved) + 4 * size)
-        margin = _EPS * (reach + 16 * np.abs(c))
+        size = np.abs(moved[at]).max(initial=Real(0))  # bounds the correction's terms
+        margin = _EPS * (abs(B) @ (16 * np.abs(moved) + 4 * size) + 16 * np.abs(c))
         required = enforced | closed | (contact & (gap < 0))
         if not required.any():
-            return FeasiblePoint(u)
+            return u
         if (required != enforced).any():
             enforced = required
             step = nearest(enforced)
         elif (gap[contact | enforced] >= 0).all() and (
             gap[enforced] <= 4 * margin[enforced]
         ).all():
-            return FeasiblePoint(moved)
+            return moved
         assert step is not None
         moved = moved + step((margin - gap)[enforced].astype(np.float64))
         if not np.isfinite(moved).all():
-            return _shrunk(rows, u)
+            return _shrunk(exact, u)
     gap = (c - B @ moved)[contact]
-    return FeasiblePoint(moved) if (gap >= 0).all() else _shrunk(rows, u)
+    return moved if (gap >= 0).all() else _shrunk(exact, u)
 
 
-def _shrunk(rows: _Rows, u: Extended) -> FeasiblePoint | None:
-    """Return θu ≈ u with θ ≤ 1 such that Bθu ≤ c despite rounding; None if c ≱ 0."""
-    B, c = rows.B[rows.contact], rows.c[rows.contact]
+def _shrunk(exact: Exact, u: Extended) -> Extended | None:
+    """Return θu with θ ≤ 1 such that Bθu ≤ c despite rounding; None if c ≱ 0."""
+    B, c = exact.B[exact.contact], exact.c[exact.contact]
     if (c < 0).any():
         return None
     reach = B @ u
@@ -143,80 +120,51 @@ def _shrunk(rows: _Rows, u: Extended) -> FeasiblePoint | None:
     theta = min((c[beyond] / reach[beyond]).min(initial=Real(1)), Real(1))
     for _ in range(8):  # rounding may leave Bθu > c: reduce θ again
         if not (B @ (theta * u) > c).any():
-            return FeasiblePoint(np.asarray(theta * u), theta)
+            return np.asarray(theta * u)
         theta = theta * (1 - 8 * _EPS)
-    return FeasiblePoint(np.zeros_like(u), Real(0))
+    return np.zeros_like(u)
 
 
-def _nearest(
+def _nearest_in_energy(
     mechanics: Mechanics, rows: NDArray[np.bool_]
-) -> Callable[[Vector], Vector]:
-    """Return the map from t (v,) to the δ of least energy norm with B_V δ = −t."""
+) -> Callable[[Vector], Extended]:
+    """Return the map from t (v,) to the δ of least energy norm with B_V δ = −t.
+
+    δ = −K⁺B_Vᵀμ + Rα with F_VV μ = t + B_V Rα, where F_VV = B_V K⁺B_Vᵀ is the
+    compliance of the rows.
+    """
     B_V = mechanics.rows[np.flatnonzero(rows)]
     inverse, solve = mechanics.inverse, closing(mechanics, rows)
-    constrained = mechanics.motions.constrained.astype(np.float64)
+    constrained = mechanics.motions.constrained
 
-    def step(t: Vector) -> Vector:
-        mu, alpha = solve(t, np.zeros(mechanics.motions.constrained.shape[1]))
+    def step(t: Vector) -> Extended:
+        mu, alpha = solve(t, np.zeros(constrained.shape[1]))
         return np.asarray(constrained @ alpha - inverse(B_V.T @ mu))
 
     return step
 
 
-def feasible_at_rows(
-    exact: Exact,
-    R: NDArray[np.float64],
-    softness: Vector,
-    u: Extended,
-    closed: NDArray[np.bool_],
-) -> FeasiblePoint | None:
-    """Find a feasible point, moving only components on which the rows depend.
-
-    The algorithm is the same as in `_feasible_near`.
-
-    Parameters
-    ----------
-    exact : contact and friction rows; B has a column for each of the w components that
-        occur in rows
-    R : (w, p) rigid motions that change gaps or slip; they cost no energy
-    softness : (w,) 1/Kᵢᵢ, zero at prescribed components
-    u : (w,) displacement of these components
-    closed : (m,) mask of the rows to satisfy with equality
-
-    Returns
-    -------
-    a point whose `u` (w + p,) is the displacement of these components, followed by the
-    coefficients of R in it; None on failure
-
-    """
-    none = csr_array((exact.c.size, R.shape[1]))
-    B = csr_array(hstack([exact.B, none.astype(Real)]))
-    nearest = partial(_nearest_at_rows, exact.B.astype(np.float64), R, softness)
-    start = np.concatenate([u, np.zeros(R.shape[1], dtype=Real)])
-    return _feasible_near(_Rows(B, exact.c, exact.contact), start, closed, nearest)
-
-
 def _nearest_at_rows(
-    B: csr_array, R: NDArray[np.float64], softness: Vector, rows: NDArray[np.bool_]
-) -> Callable[[Vector], Vector]:
-    """Return the map from t to (δ + Rα, α) with B_V(δ + Rα) = −t and least δ.
+    exact: Exact, R: Any, rows: NDArray[np.bool_]
+) -> Callable[[Vector], Extended]:
+    """Return the map from t (v,) to δ + Rα with B_V(δ + Rα) = −t and least δ.
 
-    The norm of δ is induced by diag(1/softness), which is infinite at prescribed
-    components. The rigid motion Rα does not contribute to this norm.
+    δ moves only components on which the rows depend. Its norm is induced by
+    diag(1/softness), which is infinite at prescribed components. The rigid motion Rα (R
+    of shape (n, p)) does not contribute to this norm.
     """
-    B_V = csr_array(B[np.flatnonzero(rows)])
-    moved = csr_array((B_V * softness).T)
+    B_V = exact.B[np.flatnonzero(rows)].astype(np.float64)
+    moved = csr_array((B_V * exact.softness).T)
     S = csc_array(B_V @ moved)
     shift = 1e-13 * S.diagonal().max() + np.finfo(float).tiny
     factor = splu(csc_matrix(S + shift * eye_array(S.shape[0])))
-    G = B_V @ R
+    G = (B_V @ R).toarray().astype(np.float64)
     SG = factor.solve(G) if G.size else G
     stiff = np.linalg.pinv(G.T @ SG, hermitian=True)
 
-    def step(t: Vector) -> Vector:
+    def step(t: Vector) -> Extended:
         alpha = -(stiff @ (SG.T @ t))
-        delta = R @ alpha - moved @ factor.solve(t + G @ alpha)
-        return np.concatenate([delta, alpha])
+        return np.asarray(R @ alpha - moved @ factor.solve(t + G @ alpha))
 
     return step
 
@@ -289,7 +237,9 @@ def _compliance(
     return lambda t: np.asarray(cg(F, t, rtol=1e-8, maxiter=300, M=M)[0])
 
 
-def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extended:
+def balanced(
+    bodies: Mechanics | DecomposedMechanics, multipliers: Extended, u: Extended
+) -> Extended:
     """Return λ̂ near `multipliers` in equilibrium with the load; see `Balance.near`.
 
     Raises
@@ -300,50 +250,37 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
         bound, could balance the load.
 
     """
-    exact, motions = mechanics.exact, mechanics.motions
-    free, f, names = motions.free, exact.f, mechanics.names
+    exact, motions = bodies.exact, bodies.motions
+    free, f, size = motions.free, exact.f, np.abs(exact.f)
     if free.shape[1]:
         largest = abs(free).max(axis=0).toarray().ravel()
-        along, terms = free.T @ f, abs(free).T @ np.abs(f)
-        if is_driven(along, terms, np.abs(f).sum() * largest):
-            pushed = mechanics.rigid.T @ (free @ along)
-            raise UncertifiableError(driven(pushed, names))
+        along, terms = free.T @ f, abs(free).T @ size
+        rounding = MOTION_ROUNDING * terms + LOAD_ROUNDING * size.sum() * largest
+        if (np.abs(along) > rounding).any():
+            pushed = bodies.rigid.T @ (free @ along)
+            raise UncertifiableError(_unbalanced(pushed, bodies.names))
     return Balance(
         motions.G,
         np.asarray((abs(exact.B) @ motions.largest).toarray()),
         motions.constrained.T @ f,
-        motions.largest.T @ np.abs(f),
+        motions.largest.T @ size,
         motions.KR.T @ u,
         exact.forces,
     ).near(multipliers)
 
 
-def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
-    """Return True if a load acts along any motion that changes neither gaps nor slip.
-
-    A load that does not exceed its rounding counts as zero.
-
-    Parameters
-    ----------
-    along, terms : (q,) load along each motion, and the sum of its absolute terms
-    most : (q,) sum of the absolute loads times the largest entry of each motion
-
-    """
-    return bool((np.abs(along) > MOTION_ROUNDING * terms + LOAD_ROUNDING * most).any())
-
-
-def driven(pushed: Extended, names: Sequence[str]) -> str:
+def _unbalanced(pushed: Extended, names: tuple[str, ...]) -> str:
     """Return the error message for a load that neither contact nor supports balance.
 
     pushed : (r,) load along each rigid motion, ordered by body
     """
     most = int(np.abs(pushed).argmax()) if pushed.size else 0
-    per_body = pushed.size // len(names) if names else 1
-    directions = ("along x", "along y", "in rotation")
-    which = f"body {names[most // 3]}" if per_body == 3 else "some body"
+    body, where = "some body", "along a rigid motion"
+    if names and pushed.size == 3 * len(names):
+        body = f"body {names[most // 3]}"
+        where = ("along x", "along y", "in rotation")[most % 3]
     return (
-        f"nothing balances the load of {which} "
-        f"{directions[most % 3] if per_body == 3 else 'along a rigid motion'}: "
+        f"nothing balances the load of {body} {where}: "
         "contact does not resist this motion, and no support prevents it"
     )
 

@@ -67,7 +67,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
+from mortarbench.harness.mechanics import (
+    DecomposedMechanics,
+    Extended,
+    Mechanics,
+    Real,
+)
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.active_set_refinement import (
@@ -86,13 +91,13 @@ from mortarbench.harness.verify.kkt import largest_eigenvalue
 from mortarbench.harness.verify.substructured import (
     Rounding,
     Split,
+    Subdomains,
     Undivided,
     length,
     neighbour,
-    without_rigid_motion,
 )
 
-__all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
+__all__ = ["Certificate", "UncertifiableError", "certify", "certify_pair", "proof"]
 
 #: Largest residual with which a combination of rows of G counts as equal to a supported
 #: motion (`_reach`).
@@ -269,24 +274,44 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     return certificate
 
 
-@np.errstate(
-    all="ignore"
-)  # a point may contain 1e300; an overflow raises UncertifiableError
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """Bound the error of `s`, a solution returned by ``mechanics.to_primal``.
 
+    If the bodies are decomposed, the certificate is evaluated by subdomains.
+
+    Raises
+    ------
+    UncertifiableError
+        See `certify_pair`.
+
+    """
+    bodies = mechanics if mechanics.subdomains is None else mechanics.subdomains()
+    return certify_pair(bodies, s.x, mechanics.multipliers(s))
+
+
+@np.errstate(
+    all="ignore"
+)  # a point may contain 1e300; an overflow raises UncertifiableError
+def certify_pair(
+    bodies: Mechanics | DecomposedMechanics, claimed: Vector, multipliers: Vector
+) -> Certificate:
+    """Bound the error of a displacement; multipliers suggest admissible forces.
+
     Up to four pairs (û, λ̂) are tried, and the certificate with the smallest `error` is
-    returned (for decomposed bodies, see `harness.verify.over_ranks`):
+    returned:
 
     1. the pair of the answer, changed as little as admissibility requires;
     2. if the first pair yields no sharp certificate, as for an interior point with
        positive multipliers and gaps: a pair with the active rows that the answer
-       suggests;
-    3. if only contact supports a body, and the first two pairs prove a bound of at most
-       `MAX_EXCHANGE_BOUND` but no sharp one: the solution for the closed rows that the
-       answer suggests, after at most `EXCHANGE_ROUNDS` exchanges of rows;
+       suggests (first for decomposed bodies);
+    3. if only contact supports an undivided body, and the first two pairs prove a bound
+       of at most `MAX_EXCHANGE_BOUND` but no sharp one: the solution for the closed
+       rows that the answer suggests, after at most `EXCHANGE_ROUNDS` exchanges of rows;
     4. if no other pair proves a bound: the pair near zero, which does not depend on the
        answer.
+
+    claimed : (n,) displacement of the answer
+    multipliers : (m,) multipliers of contact, then of friction with positive bounds
 
     Raises
     ------
@@ -294,17 +319,20 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
         If the answer contains NaN or inf, or if no pair proves a bound.
 
     """
-    if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
+    if not (np.isfinite(claimed).all() and np.isfinite(multipliers).all()):
         raise UncertifiableError("the answer contains NaN or inf")
-    if mechanics.certify_by_subdomains is not None:
-        certificate: Certificate = mechanics.certify_by_subdomains(
-            s.x, mechanics.multipliers(s)
+    if not isinstance(bodies, Mechanics):
+        divided = Subdomains(bodies)
+        return sharpest(
+            _certificates(divided, claimed, multipliers),
+            lambda: _at_rest(divided, claimed),
         )
-        return certificate
-    split = Undivided(mechanics)
-    best = sharpest(_certificates(split, s), lambda: _at_rest(split, s))
-    best = including_lift(mechanics, best)
-    if best.least >= best.error or mechanics.lift.any():
+    split = Undivided(bodies)
+    best = sharpest(
+        _certificates(split, claimed, multipliers), lambda: _at_rest(split, claimed)
+    )
+    best = including_lift(bodies, best)
+    if best.least >= best.error or bodies.lift.any():
         return best
     return replace(best, least=max(best.least, _least_norm(split)))
 
@@ -352,7 +380,7 @@ def _least_norm(split: Undivided) -> float:
 
     The bound is 0 if the pair is not admissible.
     """
-    mechanics = split.mechanics
+    mechanics = split.bodies
     u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
         return proof(split, u, u, lam, active.closed).least
@@ -360,38 +388,37 @@ def _least_norm(split: Undivided) -> float:
         return 0.0
 
 
-def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
+def _certificates(
+    split: Split, claimed: Vector, multipliers: Vector
+) -> Iterator[Certificate | str]:
     """Yield certificates of pairs, or reasons for their absence, until one is sharp."""
-    mechanics = split.mechanics
-    exact, u = mechanics.exact, s.x.astype(Real)
-    u[exact.fixed] = 0
-    multipliers = mechanics.multipliers(s).astype(Real)
-    multipliers = exact.forces.project(multipliers)
-    active = suggested(exact, u, multipliers)
-    complementary = active.at_bounds(multipliers), active.closed
-    pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), complementary]
+    exact, u = split.exact, split.free(claimed.astype(Real))
+    lam = exact.forces.project(multipliers.astype(Real))
+    active = suggested(exact, u, lam)
+    complementary = active.at_bounds(lam), active.closed
+    pairs = [(lam, np.zeros(lam.size, dtype=bool)), complementary]
     bound = np.inf
-    for pair in pairs:
-        outcome = _proved(split, s.x, u, *pair)
+    for pair in pairs if isinstance(split, Undivided) else pairs[::-1]:
+        outcome = _proved(split, claimed, u, *pair)
         yield outcome
         if is_sharp(outcome):
             return
         if isinstance(outcome, Certificate):
             bound = min(bound, outcome.bound)
-    exchangeable = mechanics.kernel.shape[1] > 0
-    if exchangeable and SHARP_BOUND < bound <= MAX_EXCHANGE_BOUND:
-        v, mu, active = exchanged(mechanics, active, EXCHANGE_ROUNDS)
-        yield _proved(split, s.x, v, mu, active.closed)
+    if not isinstance(split, Undivided) or not split.motions.all.shape[1]:
+        return
+    if SHARP_BOUND < bound <= MAX_EXCHANGE_BOUND:
+        v, mu, active = exchanged(split.bodies, active, EXCHANGE_ROUNDS)
+        yield _proved(split, claimed, v, mu, active.closed)
 
 
-def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
+def _at_rest(split: Split, claimed: Vector) -> Certificate | str:
     """Return the certificate of the pair near zero, or the reason why it is missing."""
-    exact = split.mechanics.exact
-    u, lam = np.zeros(exact.f.size, dtype=Real), np.zeros(exact.c.size, dtype=Real)
-    return _proved(split, s.x, u, lam, np.zeros(lam.size, dtype=bool))
+    u, lam = np.zeros_like(split.exact.f), np.zeros_like(split.exact.c)
+    return _proved(split, claimed, u, lam, np.zeros(lam.size, dtype=bool))
 
 
-def _proved(split: Undivided, *pair: Any) -> Certificate | str:
+def _proved(split: Split, *pair: Any) -> Certificate | str:
     """Return the certificate of a pair, or the reason why it has no certificate."""
     try:
         return proof(split, *pair)
@@ -407,7 +434,7 @@ def is_sharp(outcome: Certificate | str) -> bool:
 
 
 def proof(
-    split: Undivided,
+    split: Split,
     claimed: Vector | Extended,
     u: Extended,
     multipliers: Extended,
@@ -421,67 +448,35 @@ def proof(
     Raises
     ------
     UncertifiableError
-        If no admissible pair is found, or the answer is too large; see `proven`.
+        If no admissible pair is found, or if the answer is so large that its energy
+        overflows, or that the rounding of the stiffness outweighs the contact forces.
 
     """
-    mechanics = split.mechanics
-    feasible = admissible(mechanics, u, closed)
+    feasible = admissible(split.bodies, u, closed)
     if feasible is None:
         raise UncertifiableError(
             "no displacement without penetration was found near the answer"
         )
-    lam = balanced(mechanics, multipliers, feasible)
-    return proven(
-        split,
-        mechanics.exact,
-        mechanics.motions.G,
-        claimed=claimed,
-        u=feasible,
-        at_rows=feasible,
-        multipliers=lam,
-    )
+    lam = balanced(split.bodies, multipliers, feasible)
+    return _evaluated(split, claimed, feasible, lam)
 
 
-def proven(
-    split: Split,
-    exact: Exact,
-    G: Extended,
-    *,
-    claimed: Vector | Extended,
-    u: Extended,
-    at_rows: Extended,
-    multipliers: Extended,
+def _evaluated(
+    split: Split, claimed: Vector | Extended, u: Extended, lam: Extended
 ) -> Certificate:
-    """Evaluate (4) and (3) for an admissible pair, in one process or on ranks.
-
-    Parameters
-    ----------
-    exact : contact and friction rows, restricted to the w components of `at_rows`
-    G : (m, p) derivative of Bu along the rigid motions that change gaps or slip
-    claimed : (n,) displacement of the answer
-    u, at_rows : û (n,), and its values (w,) at the components that occur in rows
-    multipliers : λ̂ (m,)
-
-    Raises
-    ------
-    UncertifiableError
-        If the answer is so large that its energy overflows, or that the rounding of the
-        stiffness outweighs the contact forces.
-
-    """
-    lam, motion = multipliers, exact.motion(at_rows)
+    """Evaluate (4) and (3) for the admissible pair û (n,) and λ̂ (m,)."""
+    exact, motions, G = split.exact, split.motions, split.motions.G
+    motion = exact.motion(u)
     pressing, sliding = (w.sum() for w in exact.missing_work(lam, motion))
     work = float(pressing + sliding)
     at_u = split.residual(u)
     near = neighbour(split, at_u.rho + split.pulled(lam))
-    drift = without_rigid_motion(split, claimed - u)
+    drift = motions.without(claimed - u)
     moved = split.spread(drift)
     K_moved = split.product(moved)
-    u_u, u_d, d_d, moved_moved, moved_d = split.total(*(
-        float(a @ b) for a, b in (
-            (at_u.v, at_u.Kv), (at_u.v, near.Kd), (near.d, near.Kd),
-            (moved, K_moved), (moved, near.Kd),
-        )
+    u_u, u_d, d_d, moved_moved, moved_d = (float(a @ b) for a, b in (
+        (at_u.v, at_u.Kv), (at_u.v, near.Kd), (near.d, near.Kd),
+        (moved, K_moved), (moved, near.Kd),
     ))  # fmt: skip
     supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
@@ -494,7 +489,7 @@ def proven(
     total, nearest = computed + left, max(computed - left, 0.0)
     square = total * total + 2 * work
     known = split.rounding(supported)
-    reach = _reach(split, exact, G, supported, lam, -motion, square)
+    reach = _reach(split, supported, lam, -motion, square)
     unbalanced = np.abs(supported.T @ near.unbalanced[:p])
     scattered = np.abs(supported.T) @ split.scattered(noise)[:p]
     pull = (unbalanced + scattered).astype(np.float64)
@@ -507,12 +502,12 @@ def proven(
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
-    further = np.abs(supported.T @ split.along(claimed - u)[:p]).astype(np.float64)
+    further = np.abs(supported.T @ motions.along(claimed - u)[:p]).astype(np.float64)
     gamma = reach.within(2 * gap) + further
     in_K = known.stored(from_middle + around, gamma, theta)
     # the energy in K_T of bodies that move together with their supports is zero
     if off is not None:
-        turned = np.abs(supported.T @ split.along(off[0])[:p]).astype(np.float64)
+        turned = np.abs(supported.T @ motions.along(off[0])[:p]).astype(np.float64)
         pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
     stretch = _root(1 + theta)
@@ -584,8 +579,6 @@ class _Reach(NamedTuple):
 
 def _reach(
     split: Split,
-    exact: Exact,
-    G: Extended,
     supported: NDArray[np.float64],
     lam: Extended,
     gaps: Extended,
@@ -604,7 +597,8 @@ def _reach(
     if not supported.shape[1]:
         return _Reach(*np.zeros((3, 0)))
     tiny = np.finfo(float).tiny
-    phi, motions = np.sqrt(exact.compliance.astype(np.float64)), G.astype(np.float64)
+    exact, motions = split.exact, split.motions.G.astype(np.float64)
+    phi = np.sqrt(exact.compliance.astype(np.float64))
     lower, upper = exact.forces.chords(lam)
     down, up = lam > lower, lam < upper
     below = np.maximum((lam - lower)[down].astype(np.float64), tiny)

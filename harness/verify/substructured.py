@@ -14,10 +14,10 @@ the stored K. The other is a solution d of
 
 in double precision; the residual of d is evaluated in extended precision. An undivided
 body is a single subdomain with eliminated supports: T = I and d = K⁺ρ (`Undivided`).
-For decomposed bodies, ρ is distributed over the subdomains as in balancing domain
-decomposition (Mandel 1993). The forces b with Tᵀb = ρ are in equilibrium on every
-subdomain, R_Tᵀb = 0, where the columns of R_T are the rigid motions of subdomains. With
-the diagonal matrix W of the stiffnesses of all copies,
+For decomposed bodies (`Subdomains`), ρ is distributed over the subdomains as in
+balancing domain decomposition (Mandel 1993). The forces b with Tᵀb = ρ are in
+equilibrium on every subdomain, R_Tᵀb = 0, where the columns of R_T are the rigid
+motions of subdomains. With the diagonal matrix W of the stiffnesses of all copies,
 
     b = WT(TᵀWT)⁻¹ρ − ZR_T μ,   R_TᵀZR_T μ = R_TᵀWT(TᵀWT)⁻¹ρ,
       Z = W − WT(TᵀWT)⁻¹TᵀW
@@ -36,23 +36,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
-from scipy.sparse import csc_array, csc_matrix, csr_array, hstack
+from scipy.sparse import csc_array, csc_matrix, csr_array
 from scipy.sparse.linalg import splu
 
 from mortarbench.harness.mechanics import (
+    DecomposedMechanics,
     Extended,
     Mechanics,
     Real,
-    Substructures,
     cancelling,
 )
 from mortarbench.harness.qp import Vector
-from mortarbench.harness.verify.products import times_columns
+from mortarbench.harness.verify.products import times_columns, times_rows
 
 #: Safety factor for the relative difference of the energies in K and K_T, which is
 #: estimated at û. The relative difference is largest for displacements of low energy,
@@ -71,63 +71,6 @@ MAX_REFINEMENTS = 6  #: largest number of refinements of d
 #: Relative norm of a correction of d below which the refinement ends. Bounds are
 #: reported with fewer digits.
 REFINEMENT_TOLERANCE = 1e-6
-
-
-class Split(Protocol):
-    """Operations of the certificate with K = TᵀK_T T + E.
-
-    Vectors (n,) of components have extended precision and are zero on fixed components;
-    vectors (N,) contain the copies of components in all subdomains. Columns of R are
-    the rigid motions that the supports allow; the first p columns change gaps or slip.
-    """
-
-    def along(self, v: Extended) -> Extended:
-        """Return the coefficients Rᵀv (r,)."""
-
-    def motion(self, alpha: Extended) -> Extended:
-        """Return the rigid motion Rα (n,)."""
-
-    def residual(self, u: Extended) -> Residual:
-        """Return Ku − f with the stored K, and K_T v for v = T(u − RRᵀu)."""
-
-    def pulled(self, multipliers: Extended) -> Extended:
-        """Return the contact forces Bᵀλ (n,)."""
-
-    def spread(self, u: Extended) -> Extended:
-        """Return the copies Tu (N,) of u (n,)."""
-
-    def joined(self, b: Extended) -> Extended:
-        """Return the sums Tᵀb (n,) over the copies of each component."""
-
-    def averaged(self, v: Extended) -> Extended:
-        """Return the averages (n,) of the copies v (N,), after `Sharing.matched`."""
-
-    def product(self, v: Extended) -> Extended:
-        """Return K_T v (N,)."""
-
-    def solve(self, rho: Extended) -> Vector:
-        """Return a solution d (N,) of (5) in double precision, for ρ with Rᵀρ = 0."""
-
-    def total(self, *numbers: float) -> list[float]:
-        """Sum each number over all processes."""
-
-    def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Bound E along combinations `supported` (p, h) of the first p columns of R."""
-
-    def excess(self, w: Extended) -> tuple[Extended, float]:
-        """Return Ew (n,) and |wᵀEw| for w (n,) with Rᵀw = 0.
-
-        In contrast to other vectors, w may be nonzero on fixed components.
-        """
-
-    def scattered(self, v: Extended) -> Extended:
-        """Return the standard deviation (r,) of Rᵀv for random signs of v (n,).
-
-        This is √((R∘R)ᵀ(v∘v)).
-        """
-
-    def noise(self, u: Extended) -> Extended:
-        """Return a sample (n,) of the rounding of Ku − f in `residual`."""
 
 
 class Residual(NamedTuple):
@@ -168,10 +111,111 @@ class Neighbour(NamedTuple):
     unbalanced: Extended  #: (r,)  Rᵀ(ρ − TᵀK_T d)
 
 
-def without_rigid_motion(split: Split, v: Extended) -> Extended:
-    """Subtract the rigid motions from v (n,):  v − RRᵀv."""
-    alpha = split.along(v)
-    return v - split.motion(alpha) if alpha.size else v
+class Split(ABC):
+    """Operations of the certificate with K = TᵀK_T T + E.
+
+    Vectors (n,) of components have extended precision and are zero on fixed components;
+    vectors (N,) contain the copies of components in all subdomains. Columns of R are
+    the rigid motions that the supports allow; the first p columns change gaps or slip.
+    """
+
+    precision: Any  #: type of numbers in which the products of `noise` are rounded
+
+    def __init__(self, bodies: Mechanics | DecomposedMechanics) -> None:
+        self.bodies = bodies
+        self.exact, self.motions = bodies.exact, bodies.motions
+
+    @property
+    @abstractmethod
+    def stored(self) -> csr_array | None:
+        """The assembled K (n, n), if it is stored."""
+
+    @abstractmethod
+    def spread(self, u: Extended) -> Extended:
+        """Return the copies Tu (N,) of u (n,)."""
+
+    @abstractmethod
+    def joined(self, b: Extended) -> Extended:
+        """Return the sums Tᵀb (n,) over the copies of each component."""
+
+    @abstractmethod
+    def averaged(self, v: Extended) -> Extended:
+        """Return averages (n,) of the copies v (N,), which may be moved rigidly."""
+
+    @abstractmethod
+    def product(self, v: Extended) -> Extended:
+        """Return K_T v (N,)."""
+
+    @abstractmethod
+    def solve(self, rho: Extended) -> Vector:
+        """Return a solution d (N,) of (5) in double precision, for ρ with Rᵀρ = 0."""
+
+    @abstractmethod
+    def variances(self, u: Extended) -> Vector:
+        """Return sums (n,) of the squared terms of Ku."""
+
+    @abstractmethod
+    def theta(self, deformed: Extended, square: Any) -> float:
+        """Estimate the relative difference of the energies in K and K_T.
+
+        deformed : (n,) displacement without rigid motion
+        square : its energy in K_T
+        """
+
+    @abstractmethod
+    def rounding(self, supported: NDArray[np.float64]) -> Rounding:
+        """Bound E along combinations `supported` (p, h) of the first p columns of R."""
+
+    def free(self, v: Extended) -> Extended:
+        """Set v (n,) to zero on fixed components, in place."""
+        v[self.exact.fixed] = 0
+        return v
+
+    def pulled(self, multipliers: Extended) -> Extended:
+        """Return the contact forces Bᵀλ (n,)."""
+        return self.free(np.asarray(self.exact.B.T @ multipliers))
+
+    def residual(self, u: Extended) -> Residual:
+        """Return Ku − f, and K_T v for v = T(u − RRᵀu).
+
+        With the projection of Kv onto R, the product of K with rigid motions R is KR,
+        which is computed by `cancelling`, since its terms cancel. The rounding of K
+        along free motions is disregarded.
+        """
+        R, KR = self.motions.constrained, self.motions.KR
+        deformed = self.motions.without(u)
+        v = self.spread(deformed)
+        Kv = self.product(v)
+        rho = self.joined(Kv) - self.exact.f
+        if R.shape[1]:
+            rho += KR @ (R.T @ u) + R @ (KR.T @ deformed)
+        return Residual(self.free(rho), v, Kv, self.theta(deformed, v @ Kv))
+
+    def noise(self, u: Extended) -> Extended:
+        """Return a sample (n,) of the rounding of Ku."""
+        return self.free(sample(self.variances(u), u, self.precision))
+
+    def excess(self, w: Extended) -> tuple[Extended, float]:
+        """Return Ew (n,) and |wᵀEw| for w (n,) with Rᵀw = 0.
+
+        In contrast to other vectors, w may be nonzero on fixed components. Kw is
+        computed by `cancelling`, because the terms of Kw cancel if w moves bodies far
+        together with their supports. If K is not stored, the result is a sample.
+        """
+        if self.stored is None:
+            off = sample(self.variances(w), w, self.precision)
+            return self.free(off), float(np.sqrt(w**2 @ off**2))
+        v = self.spread(w)
+        Kw, Kv = cancelling(self.stored, w[:, None])[:, 0], self.product(v)
+        return self.free(Kw - self.joined(Kv)), abs(float(w @ Kw - v @ Kv))
+
+    def scattered(self, v: Extended) -> Extended:
+        """Return the standard deviation (r,) of Rᵀv for random signs of v (n,).
+
+        This is √((R∘R)ᵀ(v∘v)).
+        """
+        R = self.motions.all
+        return np.asarray(np.sqrt(R.multiply(R).T @ v**2))
 
 
 def neighbour(split: Split, rho: Extended) -> Neighbour:
@@ -186,11 +230,10 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
     d = Kd = split.spread(0 * rho)
     rest, before = rho, np.inf
     for _ in range(MAX_REFINEMENTS):
-        unbalanced = split.along(rest)
-        balanced = rest - split.motion(unbalanced) if unbalanced.size else rest
-        step = split.solve(balanced).astype(Real)
+        unbalanced = split.motions.along(rest)
+        step = split.solve(split.motions.without(rest)).astype(Real)
         pull = split.product(step)
-        square, whole = split.total(float(step @ pull), float(d @ Kd))
+        square, whole = float(step @ pull), float(d @ Kd)
         size = np.sqrt(max(square, 0.0))
         q = size / before if before else 0.0
         if before < np.inf and size <= REFINEMENT_TOLERANCE * np.sqrt(max(whole, 0.0)):
@@ -202,113 +245,42 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
 
 def length(split: Split, force: Extended) -> float:
     """Return the dual norm of forces (n,) without their part along rigid motions."""
-    d = split.solve(without_rigid_motion(split, force)).astype(Real)
-    square = split.total(float(d @ split.product(d)))[0]
-    return float(np.sqrt(max(square, 0.0)))
+    d = split.solve(split.motions.without(force)).astype(Real)
+    return float(np.sqrt(max(float(d @ split.product(d)), 0.0)))
 
 
-def sample(
-    variances: Vector, u: Extended, components: NDArray[np.int64], real: Any
-) -> Extended:
-    """Return a sample (n,) of the rounding of Ku in the precision `real`.
+def sample(variances: Vector, u: Extended, precision: Any) -> Extended:
+    """Return a sample (n,) of the rounding of Ku in the given precision.
 
     The error of each sum is modelled as a few units in the last place of √`variances`,
     the root of the sum of the squared terms. The first contribution is RANDOM_ULPS with
     a random sign, which excites all modes. The second is SMOOTH_ULPS with the sign of
     u, since u is softer than most modes. The random sign is a hash of the number of the
-    component, so that all ranks use the same sign. The hash function is splitmix64,
-    because signs that alternate too regularly would do hardly any work along smooth
-    modes.
+    component. The hash function is splitmix64, because signs that alternate too
+    regularly would do hardly any work along smooth modes.
 
     variances : (n,) sums of the squared terms
-    components : (n,) global numbers of the components
     """
-    x = components.astype(np.uint64) + np.uint64(1)
+    x = np.arange(1, u.size + 1, dtype=np.uint64)
     for shift, by in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(by)
     sign = np.where(
         x >> np.uint64(63), RANDOM_ULPS, -RANDOM_ULPS
     ) + SMOOTH_ULPS * np.sign(u)
     sizes = np.sqrt(np.maximum(variances, 0)).astype(Real)
-    return np.asarray(sign * (np.finfo(real).eps * sizes))
+    return np.asarray(sign * (np.finfo(precision).eps * sizes))
 
 
-class _Stored(ABC):
-    """Bodies in one process, with the stored K and R."""
-
-    def __init__(self, mechanics: Mechanics) -> None:
-        self.mechanics = mechanics
-        motions = mechanics.motions
-        self.R = csr_array(hstack([motions.constrained, motions.free]))
-
-    @abstractmethod
-    def spread(self, u: Extended) -> Extended: ...
-
-    @abstractmethod
-    def joined(self, b: Extended) -> Extended: ...
-
-    @abstractmethod
-    def product(self, v: Extended) -> Extended: ...
-
-    def along(self, v: Extended) -> Extended:
-        return np.asarray(self.R.T @ v) if self.R.shape[1] else v[:0]
-
-    def motion(self, alpha: Extended) -> Extended:
-        return np.asarray(self.R @ alpha)
-
-    def free(self, v: Extended) -> Extended:
-        """Set v (n,) to zero on fixed components, in place."""
-        v[self.mechanics.exact.fixed] = 0
-        return v
-
-    def stored(self, u: Extended) -> tuple[Extended, float, Extended]:
-        """Return Ku, the energy vᵀKv of the deformation v = u − RRᵀu, and v.
-
-        Ku is evaluated as Kv + (KR)Rᵀu for the constrained motions R, where KR was
-        computed by `cancelling`, since its terms cancel. The rounding of K along free
-        motions is disregarded.
-        """
-        K, motions = csc_array(self.mechanics.primal.P), self.mechanics.motions
-        deformed = u
-        if self.R.shape[1]:
-            deformed = u - self.motion(self.along(u))
-        Ku = times_columns(K.data, K.indices, K.indptr, deformed, u.size)
-        square = float(deformed @ Ku)
-        if motions.KR.shape[1]:
-            Ku += motions.KR @ (motions.constrained.T @ u)
-        return self.free(Ku), square, deformed
-
-    def pulled(self, multipliers: Extended) -> Extended:
-        found = np.zeros(self.R.shape[0], dtype=Real)
-        at = np.unique(self.mechanics.rows.indices)
-        found[at] = self.mechanics.exact.B[:, at].T @ multipliers
-        return self.free(found)
-
-    def excess(self, w: Extended) -> tuple[Extended, float]:
-        """Return Kw − TᵀK_T Tw on free components, and |wᵀKw − (Tw)ᵀK_T Tw|.
-
-        Kw is computed by `cancelling`, because the terms of Kw cancel if w moves bodies
-        far together with their supports.
-        """
-        K, v = csr_array(self.mechanics.primal.P), self.spread(w)
-        Kw, Kv = cancelling(K, w[:, None])[:, 0], self.product(v)
-        return self.free(Kw - self.joined(Kv)), abs(float(w @ Kw - v @ Kv))
-
-    def total(self, *numbers: float) -> list[float]:
-        return list(numbers)
-
-    def scattered(self, v: Extended) -> Extended:
-        return np.asarray(np.sqrt(self.R.multiply(self.R).T @ v**2))
-
-
-class Undivided(_Stored):
+class Undivided(Split):
     """Undivided bodies: T = I, and K_T = PKP with P = I − RRᵀ."""
 
-    def residual(self, u: Extended) -> Residual:
-        """Return Ku − f; θ = 0, since K_T and K define the same norm."""
-        Ku, _, deformed = self.stored(u)
-        rho = self.free(Ku - self.mechanics.exact.f)
-        return Residual(rho, deformed, self.product(deformed), 0.0)
+    bodies: Mechanics
+    precision = Real
+
+    @property
+    def stored(self) -> csr_array:
+        """The stiffness K (n, n)."""
+        return csr_array(self.bodies.primal.P)
 
     def spread(self, u: Extended) -> Extended:
         """Return u."""
@@ -320,145 +292,135 @@ class Undivided(_Stored):
 
     def averaged(self, v: Extended) -> Extended:
         """Return v with zeros on fixed components."""
-        return self.free(v.copy())
+        return self.joined(v)
 
     def product(self, v: Extended) -> Extended:
         """Apply PKP with P = I − RRᵀ."""
-        K = csc_array(self.mechanics.primal.P)
-        v = self.mechanics.without_rigid_motion(v)
+        K, v = csc_array(self.bodies.primal.P), self.motions.without(v)
         Kv = times_columns(K.data, K.indices, K.indptr, v, v.size)
-        return self.mechanics.without_rigid_motion(Kv)
+        return self.motions.without(Kv)
 
     def solve(self, rho: Extended) -> Vector:
         """Return K⁺ρ."""
-        return np.asarray(self.mechanics.apply_inverse(rho), dtype=np.float64)
+        return np.asarray(self.bodies.apply_inverse(rho), dtype=np.float64)
 
-    def noise(self, u: Extended) -> Extended:
-        """Return a sample (n,) of the rounding of Kv with v = u − RRᵀu."""
-        K = csc_array(self.mechanics.primal.P).power(2)
-        deformed = without_rigid_motion(self, u)
-        variances = K @ deformed.astype(np.float64) ** 2
-        return self.free(sample(variances, deformed, np.arange(u.size), Real))
+    def variances(self, u: Extended) -> Vector:
+        """Return (K∘K)(v∘v) for v = u − RRᵀu, since KR is known."""
+        K = csc_array(self.bodies.primal.P).power(2)
+        return np.asarray(K @ self.motions.without(u).astype(np.float64) ** 2)
+
+    def theta(self, deformed: Extended, square: Any) -> float:
+        """Return 0, since K_T and K define the same norm."""
+        del deformed, square
+        return 0.0
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
         """Return bounds on ER, which is KR up to the projection P."""
-        motions = self.mechanics.motions
-        along = np.abs(
-            supported.T @ np.asarray(motions.constrained.T @ motions.KR) @ supported
-        )
-        strain = [length(self, motions.KR @ k) for k in supported.T]
+        R, KR = self.motions.constrained, self.motions.KR
+        along = np.abs(supported.T @ np.asarray(R.T @ KR) @ supported)
+        strain = [length(self, KR @ k) for k in supported.T]
         return Rounding(np.array(strain), along.astype(np.float64))
 
 
-class Reduction(Protocol):
-    """Sums over the subdomains of all processes.
+class Subdomains(Split):
+    """Decomposed bodies, with E sampled in double precision.
 
-    Vectors (n,) contain the components of the local subdomains; vectors (r,) contain
-    the coarse unknowns of all subdomains.
+    Residuals are evaluated with TᵀK_T T and the exact kernels of the subdomains. The
+    matrix Z of the module docstring acts only on interfaces and fixed components: for a
+    component with a single copy, W − WT(TᵀWT)⁻¹TᵀW vanishes.
     """
 
-    def completed(self, v: Any, at: Any = None) -> Any:
-        """Add other processes' contributions to v at components `at` (default: all)."""
+    bodies: DecomposedMechanics
+    precision = np.float64
 
-    def gathered(self, alpha: Vector) -> Vector:
-        """Gather the coefficients of the rigid motions of all subdomains: (r,)."""
-
-    def local_part(self, alpha: Vector) -> Vector:
-        """Extract the coefficients of the local rigid motions from alpha (r,)."""
-
-    def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
-        """Return  M − Sᵀ diag(scale) S  (r, r); M and S are sums over all subdomains.
-
-        S : (t, local) matrix with a row for each of the components `at`
-        """
-
-
-class Sharing:
-    """Distribution of forces ρ such that each subdomain is in equilibrium.
-
-    The matrix Z of the module docstring acts only on interfaces and fixed components:
-    for a component with a single copy, W − WT(TᵀWT)⁻¹TᵀW vanishes.
-    """
-
-    def __init__(
-        self,
-        parts: Substructures,
-        fixed: NDArray[np.int64],
-        floating: Any,
-        reduction: Reduction,
-    ) -> None:
-        """Set up the coarse problem.
-
-        Parameters
-        ----------
-        parts : subdomains of this process
-        fixed : prescribed components
-        floating : (r, q) coefficients in R_T of the motions that the supports allow
-        reduction : completes sums over subdomains
-
-        """
-        self._parts, self._reduction, self._floating = parts, reduction, floating
-        squares = csr_array(parts.spread)
-        squares.data = squares.data**2
+    def __init__(self, bodies: DecomposedMechanics) -> None:
+        """Assemble the coarse problem."""
+        super().__init__(bodies)
+        parts, fixed = bodies.parts, self.exact.fixed
+        T, R, w = csr_array(parts.spread), parts.kernel, parts.weight
+        self._parts, self._T = parts, T
+        squares = csr_array((T.data**2, T.indices, T.indptr), shape=T.shape)
+        total = squares.T @ w
         self._squares = squares
-        total = reduction.completed(squares.T @ parts.weight)
         #: (N,) weights D of the copies of a component, a partition of unity: TᵀDT = I
-        self.part = parts.weight / (squares @ total)
-        jointly = reduction.completed(squares.T @ np.ones(squares.shape[0])) > 1 + 1e-9
+        self._part = w / (squares @ total)
+        jointly = squares.T @ np.ones(w.size) > 1 + 1e-9
         jointly[fixed] = True
         rows = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
-        inverse = 1 / total
-        inverse[fixed] = 0
-        T, R = csr_array(parts.spread[rows]), csr_array(parts.kernel[rows])
-        touched = np.zeros(total.size, dtype=bool)
-        touched[T.indices] = True
-        number, at = np.cumsum(touched) - 1, np.flatnonzero(touched)
-        self._T = csr_array(
-            (T.data, number[T.indices], T.indptr), shape=(rows.size, at.size)
-        )
-        self._rows, self._at = rows, at
-        self._w, self._inverse = parts.weight[rows], inverse[at]
-        self._WR = scaled_rows(R, self._w)
-        self._TWR = csr_array(self._T.T @ self._WR)
-        self._RWR = csr_array(R.T @ self._WR)
+        self._inverse = 1 / total
+        self._inverse[fixed] = 0
+        self._rows, self._w, self._T_rows = rows, w[rows], csr_array(T[rows])
+        self._WR = scaled_rows(csr_array(R[rows]), self._w)
+        self._TWR = csr_array(self._T_rows.T @ self._WR)
 
     @cached_property
     def _coarse(self) -> Callable[[Vector], Vector]:
-        coarse = self._reduction.coarse(self._RWR, self._TWR, self._inverse, self._at)
-        return _coarse_solve(coarse, self._floating)
+        """Generalised inverse of R_TᵀZR_T; the kernel contains motions of bodies."""
+        R, motions = self._parts.kernel, self.motions.all.astype(np.float64)
+        A = csr_array(R[self._rows]).T @ self._WR
+        A = A - self._TWR.T @ scaled_rows(self._TWR, self._inverse)
+        return _coarse_solve(csr_array(A), (R.T @ (self._T @ motions)).toarray())
 
-    def variances(self, v: Extended) -> Vector:
-        """Return (K∘K)(u∘u) (n,), summed over subdomains with the squares of v = Tu."""
-        squares = self._parts.squared_product(v.astype(np.float64) ** 2)
-        return np.asarray(self._reduction.completed(self._squares.T @ squares))
+    @property
+    def stored(self) -> csr_array | None:
+        """The assembled K (n, n), if it is stored."""
+        return self.bodies.stored
 
-    def __call__(self, rho: Vector) -> Vector:
-        """Return b (N,) with Tᵀb = ρ (n,) on free components and R_Tᵀb = 0."""
-        parts, reduction = self._parts, self._reduction
-        b = self.part * (parts.spread @ rho)
-        for _ in range(2):  # the second pass restores digits lost by cancellation
-            mu = reduction.local_part(
-                self._coarse(reduction.gathered(parts.kernel.T @ b))
-            )
-            jumps = self._inverse * reduction.completed(self._TWR @ mu, self._at)
-            b[self._rows] -= self._WR @ mu - self._w * (self._T @ jumps)
-        return np.asarray(b)
+    def spread(self, u: Extended) -> Extended:
+        """Return Tu (N,)."""
+        return times_rows(self._T.data, self._T.indices, self._T.indptr, u)
 
-    def matched(self, v: Extended) -> Extended:
-        """Subtract from v (N,) the rigid motions of subdomains that minimise jumps.
+    def joined(self, b: Extended) -> Extended:
+        """Return Tᵀb (n,) with zeros on fixed components."""
+        T, n = self._T, self.exact.f.size
+        return self.free(times_columns(T.data, T.indices, T.indptr, b, n))
 
-        A jump is the difference between two copies of a component or, if the component
-        is fixed, between a copy and zero; jumps are weighted by Z. The coefficients α
-        of the motions satisfy R_TᵀZ(v − R_Tα) = 0, which has the same matrix as the
-        coarse problem for forces.
+    def averaged(self, v: Extended) -> Extended:
+        """Return averages (n,) after the subdomains have moved rigidly.
+
+        The motions minimise jumps, that is, differences between two copies of a
+        component or, if the component is fixed, between a copy and zero; jumps are
+        weighted by Z. The coefficients α of the motions satisfy R_TᵀZ(v − R_Tα) = 0,
+        which has the same matrix as the coarse problem for forces.
         """
-        x, reduction = v[self._rows].astype(np.float64), self._reduction
-        pulls = reduction.completed(self._T.T @ (self._w * x), self._at)
-        jumps = x - self._T @ (self._inverse * pulls)
-        alpha = reduction.local_part(
-            self._coarse(reduction.gathered(self._WR.T @ jumps))
-        )
-        return np.asarray(v - self._parts.kernel @ alpha)
+        x = v[self._rows].astype(np.float64)
+        jumps = x - self._T_rows @ (self._inverse * (self._T_rows.T @ (self._w * x)))
+        alpha = self._coarse(self._WR.T @ jumps)
+        return self.joined(self._part * (v - self._parts.kernel @ alpha))
+
+    def product(self, v: Extended) -> Extended:
+        """Return K_T v (N,)."""
+        return self._parts.product(v)
+
+    def solve(self, rho: Extended) -> Vector:
+        """Solve K_T d = b, where Tᵀb = ρ on free components and R_Tᵀb = 0."""
+        R = self._parts.kernel
+        b = self._part * (self._T @ rho.astype(np.float64))
+        for _ in range(2):  # the second pass restores digits lost by cancellation
+            mu = self._coarse(R.T @ b)
+            jumps = self._T_rows @ (self._inverse * (self._TWR @ mu))
+            b[self._rows] -= self._WR @ mu - self._w * jumps
+        return self._parts.solve(b)
+
+    def variances(self, u: Extended) -> Vector:
+        """Return (K∘K)(u∘u), summed over subdomains with the squares of Tu."""
+        squares = self.spread(u).astype(np.float64) ** 2
+        return np.asarray(self._squares.T @ self._parts.squared_product(squares))
+
+    def theta(self, deformed: Extended, square: Any) -> float:
+        """Estimate the relative difference of energies by `noise`."""
+        off = np.sqrt(deformed**2 @ self.noise(deformed) ** 2)
+        return SAFETY * float(off / square) if square > 0 else 0.0
+
+    def rounding(self, supported: NDArray[np.float64]) -> Rounding:
+        """Return bounds on ER from samples."""
+        R, p = self.motions.constrained, supported.shape[0]
+        off = [self.noise(R @ k) for k in supported.T]
+        strain, curvature = np.zeros(len(off)), np.zeros((len(off), len(off)))
+        for k, v in enumerate(off):
+            strain[k] = length(self, v)
+            curvature[k] = np.abs(supported.T) @ self.scattered(v)[:p]
+        return Rounding(strain, curvature)
 
 
 def scaled_rows(M: csr_array, scale: Vector) -> csr_array:

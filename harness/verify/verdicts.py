@@ -24,6 +24,7 @@ from mortarbench.harness.verify.certificate import (
     UncertifiableError,
     certify,
     certify_by_eigenvalue,
+    certify_pair,
 )
 from mortarbench.harness.verify.infeasibility import certificate_of
 from mortarbench.harness.verify.kkt import (
@@ -173,13 +174,16 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     if not has_point(s):
         return {}, ""
     mechanics, was_loaded = case.mechanics, LATE_IMPORT in sys.modules
-    if mechanics is None:
+    if mechanics is None and case.certifiable is None:
         least = getattr(case.qp.P, "least_eigenvalue", None)
         if least is None or not least > 0 or case.qp.b.size + case.qp.h.size:
             return {}, ""
         return _certified(lambda: certify_by_eigenvalue(case.qp, s, least))
 
     def certificate() -> Certificate:
+        if mechanics is None:
+            assert case.certifiable is not None
+            return certify_pair(*case.certifiable(s))
         return certify(mechanics, mechanics.to_primal(s))
 
     result = _certified(certificate)

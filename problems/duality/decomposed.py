@@ -189,7 +189,8 @@ def case_on_ranks(
 
     def case(lead: Lead) -> Case:
         dual, elastic = TornDual(served, lead), problem.bodies
-        mechanics = torn_mechanics(served, lead)
+        mechanics, bound = torn_mechanics(served, lead), sides.friction.bound
+        acts = np.append(np.ones(sides.c.size), bound) > 0
 
         def quantities(s: Solution) -> Mapping[str, Any]:
             state = TornSolution(dual, s, sides, elastic, len(problems))
@@ -205,7 +206,7 @@ def case_on_ranks(
             certifiable=lambda s: (
                 mechanics(),
                 dual.displacement(s),
-                dual.multipliers(s),
+                dual.multipliers(s)[acts],
             ),
         )
 

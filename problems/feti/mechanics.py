@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, null_space
-from scipy.sparse import block_diag as sparse_diag
-from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.linalg import null_space
+from scipy.sparse import csc_array, csr_array, hstack
 
 from mortarbench.harness.distributed.comm import Lead
 from mortarbench.harness.mechanics import (
@@ -19,113 +18,86 @@ from mortarbench.harness.mechanics import (
     contact_data,
     friction_discs,
 )
-from mortarbench.problems.fem.mesh import Nodes, dofs_of
+from mortarbench.problems.fem.elasticity import rigid_modes, rigid_motions
+from mortarbench.problems.fem.mesh import dofs_of
 from mortarbench.problems.feti.served import Served, parts_of
 from mortarbench.problems.feti.subdivision import Points
-from mortarbench.problems.feti.subdomains import DecomposedProblem, TornBodies
+from mortarbench.problems.feti.subdomains import DecomposedProblem
 
 
 def torn_mechanics(
     served: Served, lead: Lead, K: csc_array | None = None
 ) -> Callable[[], DecomposedMechanics]:
-    """Return a function that returns the data for certificates on rank 0.
+    """Return a function that returns the torn bodies on rank 0, for certificates.
 
-    K : (n, n) stiffness matrix of the undivided bodies, if it is assembled
+    K : (n, n) stiffness matrix of the undivided bodies; None if it is not assembled
     """
 
-    def mechanics() -> DecomposedMechanics:
-        torn, parts = served.torn.floating, parts_of(served, lead)
-        problem, contact = torn.problem, torn.problem.contact
-        n = problem.components * problem.layout.nodes
-        # all contact rows, and friction rows with bounds > 0
-        slides = contact.bound > 0
-        normals = contact.c.size - slides.size
-        active = np.flatnonzero(np.append(np.ones(normals, dtype=bool), slides))
-        B, bound = csr_array(contact.rows[active]), contact.bound[slides]
-        at, diagonal = np.unique(B.indices).astype(np.int64), np.zeros(n)
+    @cache
+    def bodies() -> DecomposedMechanics:
+        problem, parts = served.torn.problem, parts_of(served, lead)
+        contact, bound = problem.contact, problem.contact.bound
+        n, m = problem.components * problem.layout.nodes, contact.c.size
+        acts = np.append(np.ones(m - bound.size), bound) > 0
+        rows, diagonal = csr_array(contact.rows[acts]), np.zeros(n)
+        at = np.unique(rows.indices)
         diagonal[at] = parts.diagonal(at)
-        rigid, allowed, names = _rigid_motions(torn)
         return DecomposedMechanics(
             parts=parts,
             exact=contact_data(
                 problem.load(np.arange(n)).astype(Real),
-                (B, contact.c[active]),
-                friction_discs(bound, contact.tangents, normals),
+                (rows, contact.c[acts]),
+                friction_discs(bound[bound > 0], contact.tangents, m - bound.size),
                 np.unique(problem.fixed),
                 diagonal,
             ),
-            kernel=csr_array(rigid @ allowed),
-            rigid=rigid,
-            names=names,
             stored=None if K is None else csr_array(K),
+            **_rigid_motions(problem),
         )
 
-    return cache(mechanics)
+    return bodies
 
 
-def floating_bodies(problem: DecomposedProblem) -> list[int]:
-    """Return the indices of the pieces that the supports allow to move rigidly."""
-    layout, d = problem.layout, problem.components
+def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
+    """Return the fields of `DecomposedMechanics` that describe rigid motions."""
+    layout, d, names = problem.layout, problem.components, list[str]()
     node, axis = np.divmod(problem.fixed, d)
     body = problem.piece_of[layout.holder(node)]
+    none = csr_array((d * layout.nodes, 0))
+    kernel, rigid = [none], [none]
+    for b, name in enumerate(problem.names):
+        fixed, axes = node[body == b], axis[body == b]
+        if _prevents_motion(layout.position(fixed), axes, d):
+            continue
+        nodes = layout.subdomain_nodes(np.arange(layout.count))
+        of_body = np.unique(nodes.number[problem.piece_of[nodes.subdomain] == b])
+        points, dofs = layout.position(of_body), dofs_of(of_body, d)
+        R = (
+            rigid_modes(points)
+            if d > 1
+            else np.full((len(points), 1), len(points) ** -0.5)
+        )
+        at = d * np.searchsorted(of_body, fixed) + axes
+        allowed = R @ null_space(R[at]) if at.size else R.copy()
+        allowed[at] = 0
+        embedding = csr_array(
+            (np.ones(dofs.size), (dofs, np.arange(dofs.size))),
+            shape=(d * layout.nodes, dofs.size),
+        )
+        rigid.append(embedding @ csr_array(R))
+        kernel.append(embedding @ csr_array(allowed))
+        names.append(name)
+    return {
+        "kernel": csr_array(hstack(kernel)),
+        "rigid": csr_array(hstack(rigid)),
+        "names": tuple(names),
+    }
 
-    def is_supported(b: int) -> bool:
-        fixed = body == b
-        if not fixed.any():
-            return False
-        points = layout.position(node[fixed])
-        size = np.ptp(points, axis=0).max() or 1.0
-        motions = _motions((points - points[0]) / size, axis[fixed], d)
-        return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
-    return [b for b in range(int(problem.piece_of.max()) + 1) if not is_supported(b)]
-
-
-def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
-    """Return the r = d (d + 1) / 2 rigid motions (k, r) at k displacement components.
-
-    The modes are those of `problems.fem.elasticity.rigid_motions`, with rotations about
-    the origin.
-
-    points : (k, dim) point of each component
-    axis : (k,) axis of each component, 0 … d − 1
-    d : number of components per node
-    """
-    columns = [np.where(axis == k, 1.0, 0.0) for k in range(d)]
-    for k, l in combinations(range(d), 2):
-        column = np.where(axis == l, points[:, k], 0.0)
-        columns.append(np.where(axis == k, -points[:, l], column))
-    return np.stack(columns, axis=1)
-
-
-def _rigid_motions(
-    torn: TornBodies,
-) -> tuple[csr_array, NDArray[np.float64], tuple[str, ...]]:
-    """Return the rigid motions of the pieces that the supports do not fix.
-
-    The results are the orthonormal motions (n, k), regardless of supports, orthonormal
-    combinations (k, r) of them that the supports allow, and the names of the pieces.
-    """
-    problem, layout, d = torn.problem, torn.problem.layout, torn.problem.components
-    n, numbers = d * layout.nodes, floating_bodies(problem)
-    if not numbers:
-        return csr_array((n, 0)), np.zeros((0, 0)), ()
-    piece = np.empty(layout.nodes, dtype=np.int64)
-    piece[torn.nodes.number] = problem.piece_of[torn.nodes.subdomain]
-    rows, modes, allowed = list[Nodes](), list[NDArray[np.float64]](), list[Points]()
-    for b in numbers:
-        nodes = np.flatnonzero(piece == b)
-        points = layout.position(nodes)
-        points = points - points.mean(axis=0)
-        axis = np.tile(np.arange(d), nodes.size)
-        motions = _motions(np.repeat(points, d, axis=0), axis, d)
-        modes.append(np.linalg.qr(motions)[0])
-        rows.append(dofs_of(nodes, d))
-        at_fixed = modes[-1][np.isin(rows[-1], problem.fixed)]
-        free = null_space(at_fixed) if at_fixed.size else np.eye(motions.shape[1])
-        allowed.append(free)
-    entries = coo_array(sparse_diag(modes, format="coo"))
-    place = np.concatenate(rows)[entries.row], entries.col
-    rigid = csr_array((entries.data, place), shape=(n, entries.shape[1]))
-    names = tuple(problem.names[b] for b in numbers)
-    return rigid, block_diag(*allowed), names
+def _prevents_motion(points: Points, axes: NDArray[np.int64], d: int) -> bool:
+    """Return True if no rigid motion is zero along `axes[i]` at all points i."""
+    if d == 1 or not len(points):
+        return len(points) > 0
+    size = np.ptp(points, axis=0).max() or 1.0
+    R = rigid_motions(points / size)[d * np.arange(axes.size) + axes]
+    return bool(np.linalg.matrix_rank(R) == R.shape[1])
