@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import QP, Matrix, Solution, Status, Vector
-from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.solvers.smalbe import rows as orthonormal_rows
 from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.options import Options
@@ -13,24 +12,16 @@ from mortarbench.solvers.smalbe.projected import Iterate, Projected
 Array = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
-class Reduction:
-    def __init__(
-        self,
-        ranks: Ranks | None = None,
-        as_slice: Callable[[Array, Ranks], Vector] | None = None,
-    ) -> None: ...
-
 class Product:
     n: int
     count: int
-    over: Reduction
-    def __init__(self, P: Matrix, n: int, over: Reduction | None = None) -> None: ...
+    def __init__(self, P: Matrix, n: int) -> None: ...
     def __call__(self, v: Vector) -> Vector: ...
 
 class Rows:
     n: int
     source: orthonormal_rows.Rows
-    def __init__(self, rows: orthonormal_rows.Rows, over: Reduction) -> None: ...
+    def __init__(self, rows: orthonormal_rows.Rows) -> None: ...
     def fitted(self, free: NDArray[np.bool_], r: Vector) -> Vector: ...
     def met(self, nu: Vector, tol: float, least: float) -> bool: ...
 
@@ -93,7 +84,6 @@ def relative_residual(
     Px: Vector,
     diagonal: Vector,
     G: Matrix,
-    over: Reduction,
 ) -> float: ...
 def orthonormal(
     G: Array, e: Vector

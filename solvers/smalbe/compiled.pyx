@@ -2,12 +2,12 @@
 # cython: initializedcheck=False
 """Compiled part of SMALBE: preparation, MPRGP, outer loop, recovery of the solution.
 
-A single loop, written in terms of a few operations, solves all problems. On one
-process, the operations run without Python if P is a matrix or a compiled linear map
-(`mortarbench.harness.distributed.sparse`). Sums over ranks, products with rows that
-ranks share, and all other operators and preconditioners call Python functions.
+A single loop, written in terms of a few operations, solves all problems. The
+operations run without Python if P is a matrix or a compiled linear map
+(`mortarbench.harness.distributed.sparse`). All other operators and preconditioners call
+Python functions; the rest of the loop stays compiled.
 
-* operations.pxi: sums over processes, products with F, products with orthonormal rows
+* operations.pxi: products with F, products with orthonormal rows
 * coarse.pxi: sparse rows and the factor of GGᵀ
 * feasible_set.pxi: steps to the boundary of the set, projections, φ and β
 * model.pxi: the model of H, minimised over the set and inverted on a face

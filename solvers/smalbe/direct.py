@@ -27,7 +27,7 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector
 from mortarbench.solvers.common.conversion import check_positive, dense, needs_dense
-from mortarbench.solvers.smalbe.compiled import Reduction, relative_residual
+from mortarbench.solvers.smalbe.compiled import relative_residual
 from mortarbench.solvers.smalbe.driver import MAX_IDLE_TIGHTENINGS
 from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
@@ -118,8 +118,8 @@ class _Task:
             a = self._fitted(a, x, Px + qp.q)
             x, Px, z_box = faces.at(a)
         y = self.rows.multipliers(a)
-        s, serial = self.solution(x, y, z_box), Reduction()
-        worst = relative_residual(qp, s, tol, Px, faces.diagonal, self.rows.G, serial)
+        s = self.solution(x, y, z_box)
+        worst = relative_residual(qp, s, tol, Px, faces.diagonal, self.rows.G)
         return _Point(x, y, z_box, worst)
 
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import QP, Discs, Solution, Status, Vector
-from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.solvers.common.stopping import relative_residual
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
@@ -236,8 +235,8 @@ def _projected(
     """
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and qp.q.any():
-        # q is closer to the first eigenvector than a random vector is, and does not
-        # depend on the number of ranks; without rows, no step depends on the norm
+        # q is closer to the first eigenvector than a random vector is; without rows, no
+        # step depends on the norm
         find = partial(by_lanczos, steps=steps if qp.b.size else 1, start=qp.q)
     sparse = scaled if isinstance(scaled, ScaledSparse) else None
     if sparse is not None and sparse.with_factor:
@@ -246,10 +245,7 @@ def _projected(
     else:
         problem = projected_problem(qp, find)
     problem.tests_residuals = sparse is not None or (
-        options.expansion == "model"
-        and not qp.b.size
-        and problem.diagonal.size > 0
-        and not isinstance(qp.q, DistributedVector)
+        options.expansion == "model" and not qp.b.size and problem.diagonal.size > 0
     )
     return problem
 
@@ -309,7 +305,7 @@ def _start(task: _Task, tol: float) -> Iterate:
     changes.
     """
     problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
-    x, mu = np.zeros(problem.F.n), problem.rows.no_multipliers
+    x, mu = np.zeros(problem.F.n), np.zeros(len(problem.rows.C))
     if carry is not None:
         lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
         root = 1.0 if task.scaled is None else task.scaled.root
@@ -550,8 +546,7 @@ def _residual(task: _Task, point: Solution, Fx: Vector, tol: float) -> float:
     if task.eliminated is not None:
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
-    over = task.problem.F.over
-    return compiled.relative_residual(qp, point, tol, Fx, diagonal, G, over)
+    return compiled.relative_residual(qp, point, tol, Fx, diagonal, G)
 
 
 def _counted(task: _Task, point: Solution) -> Solution:

@@ -27,7 +27,6 @@ cdef struct Parts:
 cdef class FeasibleSet:
     """The box l ≤ x ≤ u, and discs over variables without bounds.
 
-    Vectors may be distributed over processes, but each disc belongs to one process.
     Each operation passes over the vectors once and computes all sums that a step needs,
     because separate operations would read each vector several times per CG step. Either
     all variables of a disc are free, or all of them are active (discs.h).
@@ -37,16 +36,15 @@ cdef class FeasibleSet:
     cdef const double *lower
     cdef const double *upper
     cdef const double *upper_if_any  # NULL if all upper bounds are inf
-    cdef Reduction over
-    cdef discs D  # discs of this process; the count may be zero
-    cdef bint has_discs  # true if any process has discs
+    cdef discs D  # the count may be zero
+    cdef bint has_discs
     cdef object arrays  # keeps the memory that D points to
 
     @staticmethod
-    cdef FeasibleSet of(const double *lower, const double *upper, Py_ssize_t n, Reduction over):
+    cdef FeasibleSet of(const double *lower, const double *upper, Py_ssize_t n):
         cdef FeasibleSet new = FeasibleSet.__new__(FeasibleSet)
         cdef Py_ssize_t i
-        new.n, new.over, new.lower, new.upper = n, over, lower, upper
+        new.n, new.lower, new.upper = n, lower, upper
         for i in range(n):
             if upper[i] < INFINITY:
                 new.upper_if_any = upper
@@ -54,9 +52,9 @@ cdef class FeasibleSet:
         return new
 
     cdef int add_discs(self, sets, const double *shift) except -1:
-        """Add discs ‖x_I + shift_I‖ ≤ r; a collective call on all processes.
+        """Add discs ‖x_I + shift_I‖ ≤ r.
 
-        sets : at least one `harness.sets.discs.Discs`, with the discs of this process
+        sets : at least one `harness.sets.discs.Discs`
         shift : (n,), NULL for zero
         """
         cdef const int[::1] start, index
@@ -106,20 +104,18 @@ cdef class FeasibleSet:
         if self.D.count:
             project_discs(&self.D, y)
 
-    cdef int lengths(self, const double *x, const double *g, const double *p,
-                     const double *Hp, Line *line) except -1:
+    cdef void lengths(self, const double *x, const double *g, const double *p,
+                      const double *Hp, Line *line) noexcept:
         """Compute the step lengths along x − αp."""
-        if self.over.ranks is None and not self.has_discs:
+        if not self.has_discs:
             lengths(x, g, p, Hp, self.lower, self.upper_if_any, self.n, &line.cg)
-            return 0
+            return
         line.slope, line.curvature = dot(g, p, self.n), dot(p, Hp, self.n)
         line.feasible = self.feasible_length(x, p)
-        self.over.add(&line.slope, 2, &line.feasible)
         line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
-        return 0
 
     cdef double feasible_length(self, const double *x, const double *p) noexcept:
-        """Return the largest α for which the local part of x − αp is in the set."""
+        """Return the largest α for which x − αp is in the set."""
         cdef double least = INFINITY
         cdef Py_ssize_t i, o, size
         if not self.has_discs:
@@ -133,10 +129,9 @@ cdef class FeasibleSet:
     cdef double next_direction(
         self, double gamma, const double *x, const double *g, double *p, double *result
     ) noexcept:
-        """p ← φ − γp, in one pass; result ← local parts of gᵀp and ‖p‖².
+        """p ← φ − γp, in one pass; result ← gᵀp and ‖p‖².
 
-        Returns the largest α for which the local part of x − αp is in the set. Only for
-        sets with discs.
+        Returns the largest α for which x − αp is in the set. Only for sets with discs.
         """
         cdef double least = INFINITY
         cdef double sums[2]
@@ -152,7 +147,7 @@ cdef class FeasibleSet:
         return next_on_discs(&self.D, gamma, x, g, p, least, result)
 
     cdef bint leaves(self, const double *x, const double *g, double length) noexcept:
-        """Return True if the local part of x − φ·length is outside the set.
+        """Return True if x − φ·length is outside the set.
 
         Only for sets with discs.
         """
@@ -186,8 +181,8 @@ cdef class FeasibleSet:
         """
         sparse_update_direction(F, s, gamma, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
 
-    cdef int split(self, const double *x, const double *g, double tau, double *phi,
-                   double *free, Parts *parts) except -1:
+    cdef void split(self, const double *x, const double *g, double tau, double *phi,
+                    double *free, Parts *parts) noexcept:
         """Compute φ and `free` (1 off the boundary, else 0) for the face of x."""
         cdef Py_ssize_t i, o, size
         cdef double sums[3]
@@ -201,13 +196,12 @@ cdef class FeasibleSet:
                 parts.beta_square += sums[1]
                 parts.reduced_square += sums[2]
             split_discs(&self.D, x, g, tau, phi, free, &parts.phi_square)
-            return self.over.add(&parts.phi_square, 3)
+            return
         split(x, g, self.lower, self.upper, tau, phi, free, self.n, &parts.phi_square)
-        return self.over.add(&parts.phi_square, 3)
 
-    cdef int advance(self, double alpha, double *x, double *g, const double *p,
-                     const double *Hp, double tau, double *phi, double *free,
-                     Parts *parts) except -1:
+    cdef void advance(self, double alpha, double *x, double *g, const double *p,
+                      const double *Hp, double tau, double *phi, double *free,
+                      Parts *parts) noexcept:
         """x ← x − αp, g ← g − αHp, and `split`.
 
         Components within rounding of a bound are set to the bound. Otherwise, rounding
@@ -230,10 +224,9 @@ cdef class FeasibleSet:
                 parts.reduced_square += sums[2]
                 parts.phi_Hp += sums[3]
             advance_discs(&self.D, alpha, x, g, p, Hp, tau, phi, free, &parts.phi_square)
-            return self.over.add(&parts.phi_square, 4)
+            return
         advance(alpha, x, g, p, Hp, self.lower, self.upper_if_any, tau, phi, free,
                 self.n, &parts.phi_square)
-        return self.over.add(&parts.phi_square, 4)
 
     cdef void chop(self, const double *x, const double *g, double *beta) noexcept:
         """beta ← β, the part of g on the boundary with a feasible direction −β."""
@@ -303,7 +296,7 @@ cdef class FeasibleSet:
             s[self.D.index[i]] *= -1
 
     cdef double step_back(self, const double *x, const double *g, double tau, double *s,
-                          double *square) except? -1:
+                          double *square) noexcept:
         """s ← x − Π(x − g/τ), square ← ‖s‖²; return gᵀs."""
         cdef double sums[2]
         cdef Py_ssize_t i, j, first, last
@@ -318,7 +311,6 @@ cdef class FeasibleSet:
                 sums[1] += s[j] * s[j]
         if self.D.count:
             step_on_discs(&self.D, x, g, 1 / tau, False, s, sums)
-        self.over.add(sums, 2)
         square[0] = sums[1]
         return sums[0]
 
@@ -357,25 +349,23 @@ cdef class FeasibleSet:
     cdef double minimise_near(
         self, const double *z, const double *z_g, double tau, const double *x,
         const double *g, double *s
-    ) except? -1:
+    ) noexcept:
         """s ← z + r − x, where r is the result of `minimise` at z; return gᵀs."""
-        return self.over.total(model_minimiser_within(
+        return model_minimiser_within(
             z, z_g, tau, x, g, self.lower, self.upper, s, self.n
-        ))
+        )
 
     cdef double within(self, const double *z, const double *x, const double *g,
-                       bint release, double *s) except? -1:
+                       bint release, double *s) noexcept:
         """s ← z + s − x, with x + s set to a bound within rounding of it; return gᵀs.
 
         s is zero for components that the set fixes, unless `release` is true.
         """
-        return self.over.total(within(
-            z, x, g, self.lower, self.upper, release, s, self.n
-        ))
+        return within(z, x, g, self.lower, self.upper, release, s, self.n)
 
     cdef double inward_energy(self, const double *x, const double *g,
                               const double *diagonal, double norm,
-                              double noise) except? -1:
+                              double noise) noexcept:
         """Return Σ (norm·gᵢ)²/Dᵢ over components whose descent direction is feasible.
 
         noise : components with |norm·gᵢ| ≤ noise are omitted
@@ -388,7 +378,7 @@ cdef class FeasibleSet:
                 energy += inward_energy(x + o, g + o, self.lower + o, self.upper + o,
                                         diagonal + o, norm, noise, size)
             energy += inward_energy_of_discs(&self.D, x, g, diagonal, norm, noise)
-            return self.over.total(energy)
-        return self.over.total(inward_energy(
+            return energy
+        return inward_energy(
             x, g, self.lower, self.upper, diagonal, norm, noise, self.n
-        ))
+        )

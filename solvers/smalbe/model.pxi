@@ -68,13 +68,13 @@ cdef class Model:
             U.newton(self)
             for i in range(k):
                 there[i] = y[i] + dy[i]
-            begun = U.over_dual.total(dot(U.slope, dy, k))
+            begun = dot(U.slope, dy, k)
             U.minimise_lagrangian(self, x, g, box, s)
-            if not U.over.any(not same(U.piece, U.piece_there, U.places)):
+            if same(U.piece, U.piece_there, U.places):
                 U.finish(self, x, g, box, s)  # the Newton step is exact within a piece
                 return 0
             U.find_slope(self, s)
-            now = U.over_dual.total(dot(U.slope_there, dy, k))
+            now = dot(U.slope_there, dy, k)
             low, high, at_low, at_high, t = 0.0, 1.0, begun, now, 1.0
             for search in range(SEARCH_STEPS):
                 if fabs(now) <= 0.1 * begun or (now > 0 and t == 1) or at_low <= at_high:
@@ -86,7 +86,7 @@ cdef class Model:
                     there[i] = y[i] + t * dy[i]
                 U.minimise_lagrangian(self, x, g, box, s)
                 U.find_slope(self, s)
-                now = U.over_dual.total(dot(U.slope_there, dy, k))
+                now = dot(U.slope_there, dy, k)
                 if now > 0:
                     low, at_low = t, now
                 else:
@@ -119,7 +119,7 @@ cdef class Model:
 
     cdef double inverse(self, const double *free, const double *v, const double *along,
                         double *z) except? -1:
-        """z ← B_FF⁻¹v for a v that is zero off the face F; returns the local zᵀ`along`."""
+        """z ← B_FF⁻¹v for a v that is zero off the face F; returns zᵀ`along`."""
         if self.basis is not None:
             return self.basis.inverse(self, free, v, along, z)
         copy_scaled(1 / self.tau, v, z, self.n)
@@ -135,8 +135,6 @@ cdef class Basis:
 
     cdef Py_ssize_t n, k
     cdef Py_ssize_t places  # number of components that can be at a bound
-    cdef Reduction over  # processes that share vectors (n,)
-    cdef Reduction over_dual  # processes that share multipliers (k,)
     cdef Room dual
     cdef double *y
     cdef double *dy
@@ -230,7 +228,6 @@ cdef class DenseBasis(Basis):
         cdef Py_ssize_t stride = (k + 3) & ~3
         new.k, new.n, new.stride, new.first, new.size = k, n, stride, first, size
         new.places, new.flips = size, size + 1
-        new.over = new.over_dual = Reduction()
         new.room = Room(
             (k + 1) * n + k * size + stride * (3 * stride + size + 3) + 2 * size + 2
         )
@@ -448,7 +445,7 @@ cdef class FactoredBasis(Basis):
 
     cdef Rows rows
     cdef Coarse coarse
-    cdef object factor  # factor for the face
+    cdef BorderedFactor factor  # factor for the face
     cdef Room room
     cdef double *x_b  # (places,)
     cdef double *g_b
@@ -464,7 +461,6 @@ cdef class FactoredBasis(Basis):
         cdef FactoredBasis new = FactoredBasis.__new__(FactoredBasis)
         cdef Py_ssize_t p
         new.rows, new.coarse, new.n = rows, rows.coarse, rows.n
-        new.over, new.over_dual = rows.over, rows.over_rows
         new.k, new.places = rows.coarse.k, rows.coarse.places
         p = new.places
         new.make_room(new.k)
@@ -505,7 +501,7 @@ cdef class FactoredBasis(Basis):
         cdef Py_ssize_t i
         for i in range(self.places):
             self.coarse.active[i] = self.piece[i] != 0
-        self.coarse.solve(self.coarse.in_face(B.tau / B.w[0]), self.slope, self.dy)
+        self.coarse.in_face(B.tau / B.w[0]).solve_to(self.slope, self.dy)
         scale(B.tau, self.dy, self.k)
         return 0
 
@@ -557,6 +553,6 @@ cdef class FactoredBasis(Basis):
     cdef double inverse(self, Model B, const double *free, const double *v,
                         const double *along, double *z) except? -1:
         self.coarse.times(v, self.coarse.t)
-        self.coarse.solve(self.factor, self.coarse.t, self.coarse.y)
+        self.factor.solve_to(self.coarse.t, self.coarse.y)
         self.coarse.weigh_difference(v, self.coarse.y, self.weights, z)
         return dot(z, along, self.n)

@@ -1,5 +1,4 @@
-# MPRGP, independent of the type of the feasible set and of the distribution over
-# processes.
+# MPRGP, independent of the type of the feasible set.
 
 
 # Rounding of a cost, relative to the sum of its absolute terms. The error of a sum of k
@@ -144,14 +143,13 @@ cdef class Directions:
     """
 
     cdef Py_ssize_t n, count, most, oldest, room
-    cdef Reduction over
     cdef double *p  # (room, n)
     cdef double *Hp
     cdef double *share
     cdef double *free
 
-    def __cinit__(self, Py_ssize_t n, Py_ssize_t most, Reduction over):
-        self.n, self.most, self.over = n, most, over
+    def __cinit__(self, Py_ssize_t n, Py_ssize_t most):
+        self.n, self.most = n, most
         self.share = <double *> calloc(most + 1 + n, sizeof(double))
         if not self.share:
             raise MemoryError
@@ -168,9 +166,9 @@ cdef class Directions:
         if self.n and self.most:
             memcpy(self.free, free, self.n * sizeof(double))
 
-    cdef bint is_on(self, const double *free) except -1:
+    cdef bint is_on(self, const double *free) noexcept:
         """Return True if the directions belong to the face `free`."""
-        return not self.over.any(not same(self.free, free, self.n))
+        return same(self.free, free, self.n)
 
     cdef int add(self, const double *p, const double *Hp, double curvature) except -1:
         """Store p with curvature = pᵀHp; replaces the oldest direction if full."""
@@ -188,25 +186,22 @@ cdef class Directions:
         self.count = min(self.count + 1, self.most)
         return 0
 
-    cdef double conjugate(self, const double *phi, double *p) except? -1:
+    cdef double conjugate(self, const double *phi, double *p) noexcept:
         """Make p conjugate to all directions; return φᵀp of the old p, else 0."""
         if not self.count:
             return 0.0
         rows_times(self.Hp, p, self.share, self.count, self.n)
         self.share[self.count] = dot(phi, p, self.n)
-        self.over.add(self.share, self.count + 1)
         add_combination(-1.0, self.p, self.share, p, self.count, self.n)
         return self.share[self.count]
 
-    cdef int minimise(self, const double *g, double *s, double *Hs) except -1:
+    cdef void minimise(self, const double *g, double *s, double *Hs) noexcept:
         """Compute s and Hs such that x − s minimises the cost along all directions."""
         rows_times(self.p, g, self.share, self.count, self.n)
-        self.over.add(self.share, self.count)
         memset(s, 0, self.n * sizeof(double))
         memset(Hs, 0, self.n * sizeof(double))
         add_combination(1.0, self.p, self.share, s, self.count, self.n)
         add_combination(1.0, self.Hp, self.share, Hs, self.count, self.n)
-        return 0
 
 
 cdef class MPRGP:
@@ -258,7 +253,6 @@ cdef class MPRGP:
     cdef Rows rows
     cdef FeasibleSet set
     cdef FeasibleSet face_set  # feasible set of the step that follows a half step
-    cdef Reduction over
     cdef double inverse_norm, rho
     cdef double alpha, Gamma_square
     cdef bint reduced, proportions_by_model
@@ -329,7 +323,7 @@ cdef class MPRGP:
         at += 4 * n
         self.Hs, self.t, self.x2, self.g2 = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
-        self.face_set = FeasibleSet.of(at, at + n, n, self.over)
+        self.face_set = FeasibleSet.of(at, at + n, n)
         self.rhs, self.g0, self.marked = at + 2 * n, at + 3 * n, at + 4 * n
         self.x0 = self.z  # z is recomputed after each expansion
         at += 5 * n
@@ -483,22 +477,19 @@ cdef class MPRGP:
     cdef int record_step(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
         if note is not None:
-            note(chr(letter), self.over.vector(copied(self.x, self.n)),
-                 self.over.vector(copied(self.g, self.n)))
+            note(chr(letter), copied(self.x, self.n), copied(self.g, self.n))
         return 0
 
     # 1. The face
 
-    cdef int split(self) except -1:
+    cdef void split(self) noexcept:
         """Compute φ, `free` and `parts` at x."""
-        return self.set.split(
-            self.x, self.g, self.B.tau, self.phi, self.free, &self.parts
-        )
+        self.set.split(self.x, self.g, self.B.tau, self.phi, self.free, &self.parts)
 
-    cdef int minimise_along_directions(self) except -1:
+    cdef void minimise_along_directions(self) noexcept:
         """Minimise along the stored directions of this face, as far as feasible."""
         if not self.directions.most:
-            return 0
+            return
         if self.directions.count and self.directions.is_on(self.free):
             self.directions.minimise(self.g, self.s, self.Hs)
             self.set.lengths(self.x, self.g, self.s, self.Hs, &self.line)
@@ -506,7 +497,6 @@ cdef class MPRGP:
                 self.to(fmin(self.line.cg, self.line.feasible), self.s, self.Hs)
         if not self.directions.is_on(self.free):
             self.directions.begin(self.free)
-        return 0
 
     cdef bint is_preconditioned(self) noexcept:
         if self.M is not None or self.factor is not None:
@@ -529,7 +519,7 @@ cdef class MPRGP:
         return 0
 
     cdef const double *preconditioned_gradient(self) except NULL:
-        """Return z, the preconditioned φ on the face; store the local part of zᵀHp.
+        """Return z, the preconditioned φ on the face; store zᵀHp.
 
         With P = B_FF⁻¹ of the model alone, z = Pφ. With a matrix M that approximates
         F⁻¹ without ρQ, z = P(‖𝒫F𝒫‖ M − I)Pφ + Pφ (`solvers.smalbe.preconditioner`).
@@ -552,7 +542,7 @@ cdef class MPRGP:
             if self.M_map is not None:
                 self.M_map.apply(self.z, Mz, 1)
             else:
-                copy_result(self.M(self.over.vector(view(self.z, n))), n, Mz, "M @ v")
+                copy_result(self.M(view(self.z, n)), n, Mz, "M @ v")
             for i in range(n):
                 rest[i] = self.free[i] * (self.M_scale * Mz[i] - self.z[i])
             if self.rows.exist and self.penalty_of_M() > self.rho:
@@ -618,7 +608,7 @@ cdef class MPRGP:
         replaces s by −s, so that the step is x − αs, and stores the `lengths` of this
         step in `line`. It takes one product.
         """
-        if not self.over.any(negate(s, self.n)):
+        if not negate(s, self.n):
             return 0
         self.lengths_along(s, Hs)
         return fmin(self.line.cg, fmax(1.0, self.line.feasible))
@@ -627,7 +617,6 @@ cdef class MPRGP:
         """Increase the model until sᵀBs ≥ sᵀHs, with the product Hs."""
         cdef double sums[2]
         sums[0], sums[1] = dot(s, s, self.n), dot(s, Hs, self.n)
-        self.over.add(sums, 2)
         self.B = self.B.raised(s, sums[0], sums[1])
         return 0
 
@@ -645,7 +634,7 @@ cdef class MPRGP:
         begun : false if CG does not yet have a first direction on this face
         """
         cdef bint is_tested = self.expansion == SPECTRAL and self.spectral_length > 0
-        if self.in_two and is_tested and self.over.any(
+        if self.in_two and is_tested and (
             self.set.leaves(self.x, self.g, self.spectral_length)  # p will be φ
         ):
             return True
@@ -655,8 +644,7 @@ cdef class MPRGP:
                 self.directions.begin(self.free)
             self.first_direction()
         return not self.in_two and is_tested and (
-            self.over.least(self.set.feasible_length(self.x, self.p))
-            < self.spectral_length
+            self.set.feasible_length(self.x, self.p) < self.spectral_length
         )
 
     cdef int step_spectrally(self) except -1:
@@ -677,9 +665,9 @@ cdef class MPRGP:
         self.to(length, self.s, self.Hs, False)
         return 1
 
-    cdef bint is_settled(self) except -1:
+    cdef bint is_settled(self) noexcept:
         """Return True if the face has settled and a Newton step is due."""
-        if self.over.any(self.set.marks(self.x, self.marked)):
+        if self.set.marks(self.x, self.marked):
             self.settled = 0
         else:
             self.settled += 1
@@ -700,7 +688,6 @@ cdef class MPRGP:
         cdef Py_ssize_t i, n = self.n
         cdef double before = self.parts.phi_square + self.parts.beta_square
         cdef double enough, square
-        cdef double unknowns = self.over.total(n)
         cdef long steps = 0
         cdef double *d = self.x2
         cdef const double *z
@@ -715,9 +702,9 @@ cdef class MPRGP:
         memset(d, 0, n * sizeof(double))
         memcpy(self.phi, self.g, n * sizeof(double))
         self.set.follow(self.x, self.g, NULL, self.phi)
-        square = self.over.total(dot(self.phi, self.phi, n))
+        square = dot(self.phi, self.phi, n)
         enough = NEWTON_ACCURACY * NEWTON_ACCURACY * square
-        while square > enough and len(trace) < most and steps < unknowns:
+        while square > enough and len(trace) < most and steps < n:
             z = self.preconditioned_gradient()
             memcpy(self.p, z, n * sizeof(double))
             self.set.follow(self.x, self.g, NULL, self.p)
@@ -726,13 +713,12 @@ cdef class MPRGP:
             self.set.follow(self.x, self.g, self.p, self.Hp)
             self.sums[0] = dot(self.phi, self.p, n)
             self.sums[1] = dot(self.p, self.Hp, n)
-            self.over.add(self.sums, 2)
             if self.sums[1] <= 0:
                 break
             add(self.sums[0] / self.sums[1], self.p, d, n)
             add(-self.sums[0] / self.sums[1], self.Hp, self.phi, n)
             self.tangents.add(self.p, self.Hp, self.sums[1])
-            square = self.over.total(dot(self.phi, self.phi, n))
+            square = dot(self.phi, self.phi, n)
             trace.append(c"n")
             steps += 1
         self.patience = steps
@@ -741,7 +727,6 @@ cdef class MPRGP:
             self.s[i] = self.x[i] - self.s[i]
         self.H(self.s, self.Hs)
         self.sums[0], self.sums[1] = dot(self.g, self.s, n), dot(self.s, self.Hs, n)
-        self.over.add(self.sums, 2)
         self.line.slope, self.line.curvature = self.sums[0], self.sums[1]
         if change_along(&self.line, 1.0) >= 0:
             return False
@@ -764,7 +749,7 @@ cdef class MPRGP:
         if not square:
             return 0
         self.H(self.s, self.Hs)
-        line.curvature = self.over.total(dot(self.s, self.Hs, self.n))
+        line.curvature = dot(self.s, self.Hs, self.n)
         # gᵀs ≥ τ‖s‖² for projections. At the end of a run, rounding of large normal
         # components of g may violate this inequality, and the step would be rejected.
         line.slope = fmax(line.slope, tau * square)
@@ -819,7 +804,6 @@ cdef class MPRGP:
             )
             self.H(self.p, self.Hp)
             sums[2] = dot(self.p, self.Hp, self.n)
-            self.over.add(sums, 3, &line.feasible)
             line.slope, self.p_square, line.curvature = sums[0], sums[1], sums[2]
             line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
             return 0
@@ -830,11 +814,9 @@ cdef class MPRGP:
         )
         return 0
 
-    cdef double square_of_p(self) except? -1:
+    cdef double square_of_p(self) noexcept:
         """Return ‖p‖² of the direction of a spectral method."""
-        return self.p_square if self.in_two else (
-            self.over.total(dot(self.p, self.p, self.n))
-        )
+        return self.p_square if self.in_two else dot(self.p, self.p, self.n)
 
     # 5. The conjugate gradient step
 
@@ -882,13 +864,13 @@ cdef class MPRGP:
             self.expected_slope = self.directions.conjugate(self.phi, self.p)
             return 0
         if z != self.phi:
-            z_Hp = self.over.total(self.z_Hp)
+            z_Hp = self.z_Hp
         update_direction(z, z_Hp / curvature, self.p, self.n)
         return 0
 
-    cdef int to(
+    cdef void to(
         self, double alpha, const double *p, const double *Hp, bint stored=True
-    ) except -1:
+    ) noexcept:
         """x ← x − αp; update the gradient, `parts` and the face without a product.
 
         stored : false if φ and `free` are not needed
@@ -898,7 +880,6 @@ cdef class MPRGP:
                          self.phi if stored else NULL, self.free if stored else NULL,
                          &self.parts)
         self.knows_Cx = False
-        return 0
 
     # 6. Expansion
 
@@ -969,7 +950,7 @@ cdef class MPRGP:
             x[3 * n + i] = shift[i] + self.set.lower[i]
             x[4 * n + i] = shift[i] + self.set.upper[i]
         trial = self.step_rule(Step(
-            *map(self.over.vector, arrays), self.line.cg * self.inverse_norm,
+            *arrays, self.line.cg * self.inverse_norm,
             self.line.feasible * self.inverse_norm, self.inverse_norm / self.B.tau,
         ))  # fmt: skip
         copy_result(trial, n, y, "the trial point of the step rule")
@@ -1038,7 +1019,6 @@ cdef class MPRGP:
                 length = fmax(length, 1.0)
             change += change_along(&self.line, length)
             rest_of_step(self.x, self.g, s, Hs, z_g, z, n, self.sums)
-            self.over.add(self.sums, 2)
             self.B = self.B.raised(z, self.sums[0], self.sums[1])
             self.to(length, s, Hs)
         else:
@@ -1056,9 +1036,8 @@ cdef class MPRGP:
         """
         cdef Py_ssize_t n = self.n
         cdef long step
-        cdef double curvature = self.over.total(dot(self.p, self.Hp, n)), slope
+        cdef double curvature = dot(self.p, self.Hp, n), slope
         advance_freely(0.0, self.x2, self.g2, self.p, self.Hp, self.free, n, self.sums)
-        self.over.add(self.sums, 2)
         for step in range(most):
             if self.sums[0] <= enough:
                 break
@@ -1072,7 +1051,6 @@ cdef class MPRGP:
                 break
             advance_freely(slope / curvature, self.x2, self.g2, self.p, self.Hp,
                            self.free, n, self.sums)
-            self.over.add(self.sums, 2)
         return 0
 
     cdef int update_direction_beyond(self, double gamma) except -1:
@@ -1087,7 +1065,7 @@ cdef class MPRGP:
             self.sums[0] = update_free_direction(self.g2, self.free, gamma, self.p, self.n)
             self.H(self.p, self.Hp)
             self.sums[1] = dot(self.p, self.Hp, self.n)
-            return self.over.add(self.sums, 2)
+            return 0
         self.F.count += 1
         sparse_update_free_direction(&self.F.rows, self.inverse_norm, self.g2, self.free, gamma,
                            self.p, self.Hp, self.sums)
@@ -1110,15 +1088,15 @@ cdef class MPRGP:
 
     # 2. Sums of the stopping tests
 
-    cdef double cost(self, const double *x, const double *g) except? -1:
+    cdef double cost(self, const double *x, const double *g) noexcept:
         """Return xᵀHx − 2bᵀx, twice the cost, computed from the gradient."""
         cdef double sum_ = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):
             sum_ += x[i] * (g[i] - self.rhs[i])
-        return self.over.total(sum_)
+        return sum_
 
-    cdef int terms_of_cost(self) except -1:
+    cdef void terms_of_cost(self) noexcept:
         """`sums` ← twice the cost at x, and the sum of |terms| of this cost."""
         cdef double term, sum_ = 0.0, size = 0.0
         cdef Py_ssize_t i
@@ -1127,7 +1105,6 @@ cdef class MPRGP:
             sum_ += term
             size += fabs(term)
         self.sums[0], self.sums[1] = sum_, size
-        return self.over.add(self.sums, 2)
 
     cdef double violation(self) except? -1:
         """Return ‖Cx‖ at the iterate; CG steps update Cx without a product."""

@@ -1,6 +1,6 @@
-# The basic operations of SMALBE: sums over processes, products with F, and products
-# with orthonormal rows. On one process, these operations run without Python, except
-# products with an operator that is not compiled. Sums over MPI ranks call Python.
+# The basic operations of SMALBE: products with F, and products with orthonormal rows.
+# These operations run without Python, except products with an operator that is not
+# compiled.
 
 
 # --- numbers ------------------------------------------------------------------------
@@ -104,68 +104,6 @@ cdef int copy_result(
     return 0
 
 
-# --- sums ---------------------------------------------------------------------------
-
-
-@cython.final
-cdef class Reduction:
-    """Sums over the processes that share a vector; the identity on one process.
-
-    ranks : a `harness.distributed.vectors.Ranks`, None for one process
-    as_slice : function of an array (n,) and ranks that returns the distributed vector
-        with this local slice
-    """
-
-    cdef object ranks, as_slice
-
-    def __init__(self, ranks=None, as_slice=None):
-        self.ranks, self.as_slice = ranks, as_slice
-
-    cdef vector(self, array):
-        """Return an array as a vector for operators, distributed over the ranks."""
-        return array if self.ranks is None else self.as_slice(array, self.ranks)
-
-    cdef inline int add(
-        self, double *terms, Py_ssize_t k, double *least=NULL
-    ) except -1:
-        """Replace terms (k,) by their sums and `least` by its minimum over all processes.
-        """
-        return 0 if self.ranks is None else self.gather(terms, k, least)
-
-    cdef int gather(self, double *terms, Py_ssize_t k, double *least) except -1:
-        # The sum is taken in the order of the ranks. The result of an Allreduce could
-        # be rounded differently on each rank or in each run, and ranks that take
-        # different branches would deadlock.
-        cdef Py_ssize_t i, p, width = k + (1 if least else 0)
-        cdef const double *of_rank
-        own = np.empty(width)
-        if k:
-            memcpy(address(own), terms, k * sizeof(double))
-        if least:
-            address(own)[k] = least[0]
-        parts = self.ranks.gather_all(own)
-        of_rank = address(parts)
-        for i in range(k):
-            terms[i] = 0.0
-        for p in range(len(parts)):
-            for i in range(k):
-                terms[i] += of_rank[p * width + i]
-            if least:
-                least[0] = fmin(least[0], of_rank[p * width + k])
-        return 0
-
-    cdef inline double total(self, double term) except? -1:
-        self.add(&term, 1)
-        return term
-
-    cdef inline double least(self, double number) except? -1:
-        self.add(NULL, 0, &number)
-        return number
-
-    cdef inline bint any(self, bint here) except -1:
-        return self.total(here) > 0
-
-
 # --- products -----------------------------------------------------------------------
 
 
@@ -178,14 +116,10 @@ cdef enum:
 
 @cython.final
 cdef class Product:
-    """The operator v ↦ Pv with a counter of its products.
-
-    over : processes that share the vectors; by default a single process
-    """
+    """The operator v ↦ Pv with a counter of its products."""
 
     cdef readonly Py_ssize_t n
     cdef public long count
-    cdef readonly Reduction over
     cdef bint is_sparse
     cdef object matrix
     cdef const double *dense
@@ -193,9 +127,8 @@ cdef class Product:
     cdef LinearMap map  # P as a compiled linear map, or None
     cdef object owners, argument
 
-    def __cinit__(self, P, Py_ssize_t n, Reduction over=None):
+    def __cinit__(self, P, Py_ssize_t n):
         self.n, self.matrix = n, P
-        self.over = Reduction() if over is None else over
         if isinstance(P, np.ndarray) and n:
             whole = P if P.flags.c_contiguous else P.T
             self.owners = _whole(whole)
@@ -233,7 +166,7 @@ cdef class Product:
         """Return Pv for v (n,)."""
         result, vector = empty(self.n), _whole(v)
         self.apply(address(vector), address(result))
-        return self.over.vector(result)
+        return result
 
     cdef int apply(self, const double *v, double *y, double s=1.0) except -1:
         """y ← s Pv."""
@@ -259,7 +192,7 @@ cdef class Product:
             if self.argument is None or getrefcount(self.argument) > 2:
                 self.argument = np.empty(self.n)
             memcpy(address(self.argument), v, self.n * sizeof(double))
-            product = self.matrix @ self.over.vector(self.argument)
+            product = self.matrix @ self.argument
             copy_result(product, self.n, y, "P @ v", s)
         return 0
 
@@ -272,12 +205,11 @@ cdef class Rows:
     """Orthonormal rows C (r, n): an array, or L⁻¹G with a sparse factor L of GGᵀ.
 
     rows : a `solvers.smalbe.rows.Rows`, kept as `source`
-    over : processes that share vectors (n,)
     """
 
     cdef readonly Py_ssize_t n
     cdef Py_ssize_t r, m
-    cdef bint exist  # true if any process has rows
+    cdef bint exist  # true if r > 0
     cdef double e_size, x_tilde_size
     cdef const double *C  # NULL for C = L⁻¹G
     cdef const double *GC
@@ -285,24 +217,18 @@ cdef class Rows:
     cdef Coarse coarse  # used for C = L⁻¹G, otherwise None
     cdef readonly object source
     cdef list owners
-    cdef Reduction over
-    cdef Reduction over_rows  # processes that share vectors (r,)
 
-    def __init__(self, rows, Reduction over):
-        self.source, self.over, self.owners = rows, over, []
+    def __init__(self, rows):
+        self.source, self.owners = rows, []
         self.x_tilde = read(rows.x_tilde, self.owners)
-        self.n, self.e_size, self.over_rows = len(rows.x_tilde), rows.e_size, over
-        self.x_tilde_size = sqrt(over.total(dot(self.x_tilde, self.x_tilde, self.n)))
+        self.n, self.e_size, self.r = len(rows.x_tilde), rows.e_size, len(rows.C)
+        self.exist = self.r > 0
+        self.x_tilde_size = sqrt(dot(self.x_tilde, self.x_tilde, self.n))
         if isinstance(rows.C, np.ndarray):
-            self.r, self.m = len(rows.C), len(rows.GC)
             self.C, self.GC = read(rows.C, self.owners), read(rows.GC, self.owners)
-            self.exist = self.r > 0
+            self.m = len(rows.GC)
         else:
-            is_local = over.ranks is None and rows.on_one_process
-            self.coarse = (LocalCoarse if is_local else Coarse)(rows)
-            self.r, self.exist = self.coarse.r, len(rows.C) > 0
-            if getattr(rows.no_multipliers, "ranks", None) is None:
-                self.over_rows = Reduction()  # vectors (r,) are replicated
+            self.coarse = Coarse(rows)
 
     cdef int times(self, const double *v, double *Cv) except -1:
         """Cv ← C v."""
@@ -341,9 +267,9 @@ cdef class Rows:
         self.combine(-1.0, Cv, v, v)
         return 0
 
-    cdef double size(self, const double *a) except? -1:
+    cdef double size(self, const double *a) noexcept:
         """Return ‖a‖ = ‖Cᵀa‖ for a (r,)."""
-        return sqrt(self.over_rows.total(dot(a, a, self.r)))
+        return sqrt(dot(a, a, self.r))
 
     cdef bint are_met(
         self, const double *nu, const double *Cnu, double tol, double least
@@ -355,7 +281,7 @@ cdef class Rows:
         """
         cdef double error = self.size(Cnu), square = 0.0, part
         cdef Py_ssize_t i
-        part = sqrt(self.over.total(dot(nu, nu, self.n)))
+        part = sqrt(dot(nu, nu, self.n))
         if self.e_size == 0 or self.x_tilde_size <= SHIFT_ROUNDING * part:
             return error <= tol * fmax(part, least)
         if error > tol * self.x_tilde_size:
@@ -384,11 +310,12 @@ cdef class Rows:
             r[i] *= free[i]
         self.coarse.times(r, self.coarse.t)
         self.coarse.enter(free)
-        self.coarse.solve(self.coarse.in_face(FREE_RANK), self.coarse.t, self.coarse.y)
-        for i in range(self.coarse.k):
+        self.coarse.in_face(FREE_RANK).solve_to(self.coarse.t, self.coarse.y)
+        for i in range(self.r):
             self.coarse.y[i] = -self.coarse.y[i]
         self.coarse.product(self.coarse.y, self.coarse.t)
-        return self.coarse.forward(self.coarse.t, a)
+        self.coarse.forward(self.coarse.t, a)
+        return 0
 
     def fitted(self, free, r):
         """Return the minimiser a (r,) of ‖(r + Cᵀa)_F‖ for the free components F."""

@@ -70,13 +70,13 @@ cdef class SMALBE(MPRGP):
         self.F, self.M, self.counts = problem.F, M, problem.counts
         self.is_semidefinite = problem.semidefinite
         self.M_map = M if isinstance(M, LinearMap) else None
-        self.n, self.over = self.F.n, self.F.over
+        self.n = self.F.n
         self.norm = self.M_scale = spectrum.norm
         self.inverse_norm = 1 / self.norm
         self.owners, self.rows = [], problem.C
         self.b, self.q = read(problem.b, self.owners), read(problem.q, self.owners)
         lower, upper = read(bounds[0], self.owners), read(bounds[1], self.owners)
-        self.set = FeasibleSet.of(lower, upper, self.n, self.over)
+        self.set = FeasibleSet.of(lower, upper, self.n)
         if problem.discs:
             self.set.add_discs(
                 problem.discs, self.rows.x_tilde if self.rows.exist else NULL
@@ -101,15 +101,14 @@ cdef class SMALBE(MPRGP):
             self.tested = Room(3 * self.n)
             memcpy(self.tested.at, self.diagonal, self.n * sizeof(double))
             scale(self.inverse_norm, self.tested.at, self.n)
-            scales(self.tested.at, self.n, self.over)
+            scales(self.tested.at, self.n)
         kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
         if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
-        self.directions = Directions(self.n, kept, self.over)
-        # n is summed over all ranks, so that all ranks take the same decisions
-        self.patience = <long>fmax(FIRST_NEWTON, sqrt(self.over.total(self.n)))
+        self.directions = Directions(self.n, kept)
+        self.patience = <long>fmax(FIRST_NEWTON, sqrt(self.n))
         self.tangents = Directions(
-            self.n, MAX_DIRECTIONS if self.expansion == SPECTRAL else 0, self.over
+            self.n, MAX_DIRECTIONS if self.expansion == SPECTRAL else 0
         )
         self.choose_directions(spectrum.ritz)
         self.make_room()
@@ -223,7 +222,7 @@ cdef class SMALBE(MPRGP):
         self.rho, self.in_two = rho, False
         self.choose_models()
         self.first_direction()
-        return self.over.vector(copied(self.p, n))
+        return copied(self.p, n)
 
     def face_and_gradients(self, x, g):
         """Return vectors (n,): the mask of free components (1, else 0), φ and β."""
@@ -233,7 +232,7 @@ cdef class SMALBE(MPRGP):
         self.set.split(read(x, owners), read(g, owners), self.B.tau, address(phi),
                        address(free), &parts)
         self.set.chop(read(x, owners), read(g, owners), address(beta))
-        return self.over.vector(free), self.over.vector(phi), self.over.vector(beta)
+        return free, phi, beta
 
     # the start
 
@@ -255,14 +254,14 @@ cdef class SMALBE(MPRGP):
         self.set.project(read(x, owners), 1.0, self.rows.x_tilde, nu)
         for i in range(n):
             moved = moved or nu[i] + self.rows.x_tilde[i] != 0
-        if self.over.any(moved):
+        if moved:
             self.H(nu, g)
         else:  # 𝒫F𝒫ν = 0
             self.rows.times(nu, self.Cv)
             self.rows.combine(rho, self.Cv, g, g)
         add(-1.0, self.b, g, n)
         self.rows.combine(1.0, read(mu, owners), g, g)
-        return self.over.vector(start), self.over.vector(gradient)
+        return start, gradient
 
     # the algorithm
 
@@ -312,9 +311,9 @@ cdef class SMALBE(MPRGP):
         self.most_products, self.knows_Cx = 0, False
         multipliers = copied(address(at.mu), r)
         cdef double *mu = address(multipliers)
-        self.b_size = sqrt(self.over.total(dot(self.b, self.b, n)))
+        self.b_size = sqrt(dot(self.b, self.b, n))
         if not self.b_size:
-            self.b_size = sqrt(self.over.total(dot(self.g, self.g, n)))
+            self.b_size = sqrt(dot(self.g, self.g, n))
         self.small_gradient = tol * self.b_size
         self.coarse_gradient = options.eta * self.b_size
         self.next_tested = FIRST_TESTED * self.small_gradient
@@ -328,9 +327,7 @@ cdef class SMALBE(MPRGP):
             memcpy(self.rhs, self.b, n * sizeof(double))
             self.rows.add(-1.0, mu, self.rhs)
             self.choose_models()
-            note = watch and watch(
-                len(at.outer) + len(done), self.over.vector(copied(self.rhs, n))
-            )
+            note = watch and watch(len(at.outer) + len(done), copied(self.rhs, n))
             stopped = self.minimise(max(left, 0), trace, note)
             left -= len(trace) + 1
             solved = sqrt(self.parts.phi_square + self.parts.beta_square) <= self.small_gradient
@@ -356,9 +353,7 @@ cdef class SMALBE(MPRGP):
             # 4. Safeguards.
             errors = [*errors, error][len(errors) > 2:]
             stalled = len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
-            if (not stopped or stalled) and infeasible(
-                self.over.vector(copied(self.x, n))
-            ):
+            if (not stopped or stalled) and infeasible(copied(self.x, n)):
                 status = Status.INFEASIBLE
                 break
             if not stopped or left < 0:
@@ -372,13 +367,10 @@ cdef class SMALBE(MPRGP):
         if self.factor is not None:
             self.counts["factorisations"] = self.factor.factorisations
             self.counts["preconditioner_applies"] = self.factor.solves
-        if status is not Status.INFEASIBLE and not (
-            self.over.total(dot(self.x, self.x, n)) < INFINITY
-        ):
+        if status is not Status.INFEASIBLE and not dot(self.x, self.x, n) < INFINITY:
             status = Status.FAILED
         nu, g = copied(self.x, n), copied(self.g, n)
-        return (self.over.vector(nu), self.over.vector(g),
-                self.rows.over_rows.vector(multipliers), self.M_now, self.rho, done, status)
+        return nu, g, multipliers, self.M_now, self.rho, done, status
 
     cdef bint stops(self) except -1:
         """Return True if the inner run may end."""
@@ -447,7 +439,7 @@ cdef class SMALBE(MPRGP):
             return True
         return self.energy_error() <= self.energy * self.tol
 
-    cdef double energy_error(self) except? -1:
+    cdef double energy_error(self) noexcept:
         """Estimate the relative energy error from the remaining gradient.
 
         With the gradient r on the free components f, ‖x − x*‖_F² = rᵀF_ff⁻¹r, and each
@@ -463,21 +455,17 @@ cdef class SMALBE(MPRGP):
         for i in range(self.n):
             energy += self.q[i] * (self.rows.x_tilde[i] + self.x[i])
             most = fabs(self.q[i]) if fabs(self.q[i]) > most else most
-        most = -most
-        self.over.add(&energy, 1, &most)
         error = self.set.inward_energy(self.x, self.g, self.diagonal, self.norm,
-                                       1e3 * 2.0 ** -52 * -most)
+                                       1e3 * 2.0 ** -52 * most)
         return sqrt(error / fabs(energy)) if energy else 0.0
 
-    cdef double lagrangian(self, const double *mu) except? -1:
+    cdef double lagrangian(self, const double *mu) noexcept:
         """Return L(ν, μ), computed from the gradient; `Cv` must contain Cν."""
         cdef double sum_ = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):
             sum_ += 0.5 * self.x[i] * (self.g[i] - self.b[i])
-        return self.over.total(sum_) + 0.5 * self.rows.over_rows.total(
-            dot(mu, self.Cv, self.rows.r)
-        )
+        return sum_ + 0.5 * dot(mu, self.Cv, self.rows.r)
 
     cdef int change_penalty(self, double rho) except -1:
         """Change ρ and update the gradient, without a product."""
@@ -519,7 +507,7 @@ cdef class SMALBE(MPRGP):
             for i in range(n):
                 t[i] *= free[i]
             self.set.project(v, 1.0, t, v)
-        return self.over.vector(moved)
+        return moved
 
     def point(self, nu, mu, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
@@ -555,7 +543,6 @@ cdef class SMALBE(MPRGP):
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
             any_left = any_left or rest[i] != 0
-        any_left = self.over.any(any_left)
         if any_left and self.rows.coarse is not None:
             self.rows.times(rest, da)
             for i in range(r):
@@ -586,7 +573,4 @@ cdef class SMALBE(MPRGP):
             add_combination(-1.0, C, da, rest, r, n)
         if any_left:  # otherwise x is the unconstrained minimiser
             bound_multipliers(v, self.set.lower, self.set.upper, rest, z_box, n)
-        x_array, z_array, Fx_array = map(
-            self.over.vector, (restored_x, boxes, product)
-        )
-        return x_array, self.rows.over_rows.vector(multipliers), z_array, Fx_array
+        return restored_x, multipliers, boxes, product

@@ -36,7 +36,6 @@ import numpy as np
 from scipy.sparse import csc_matrix, diags_array, issparse
 
 from mortarbench.harness import QP, Structure
-from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.harness.operators import Preconditioned, preconditioned
 from mortarbench.solvers.smalbe.compiled import sparsity
 from mortarbench.solvers.smalbe.extension import Operator
@@ -130,10 +129,9 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
 def has_sparse_factor(qp: QP) -> bool:
     """Return True if an incomplete factor of the free block of P is cheap.
 
-    A factor requires a sparse P with a positive diagonal that this process stores. The
-    QP must have bounds only, because a factor of P does not include the penalty of
-    rows. The columns of P must have so few entries that a factor costs no more than
-    several products.
+    A factor requires a sparse P with a positive diagonal. The QP must have bounds only,
+    because a factor of P does not include the penalty of rows. The columns of P must
+    have so few entries that a factor costs no more than several products.
     """
     return _is_sparse(qp) and _sparsity(qp).pairs <= MAX_PAIRS * qp.P.nnz
 
@@ -141,8 +139,7 @@ def has_sparse_factor(qp: QP) -> bool:
 def _is_sparse(qp: QP) -> bool:
     if not issparse(qp.P) or qp.b.size or qp.h.size or not qp.q.size:
         return False
-    whole = not isinstance(qp.q, DistributedVector)
-    return whole and len(qp.sets) == 1 and bool(qp.P.nnz < 2**31)
+    return len(qp.sets) == 1 and bool(qp.P.nnz < 2**31)
 
 
 def _sparsity(qp: QP) -> Sparsity:

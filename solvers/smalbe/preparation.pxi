@@ -221,8 +221,7 @@ def lanczos(Product F, Rows C, start, int steps):
     """
     cdef Py_ssize_t i, k, n = F.n
     cdef int kept = 0
-    cdef Reduction over = F.over
-    steps = min(steps, <long> over.total(n) - len(C.source.C))
+    steps = min(steps, n - len(C.source.C))
     cdef Room room = Room((steps + 2) * n + C.r + (steps + 3) * steps)
     cdef double *basis = room.at
     cdef double *v = basis + steps * n
@@ -238,7 +237,7 @@ def lanczos(Product F, Rows C, start, int steps):
     cdef double beta, largest = 0.0, at_start
     memcpy(v, address(start), n * sizeof(double))
     C.project(v, Cv)
-    beta = sqrt(over.total(dot(v, v, n)))
+    beta = sqrt(dot(v, v, n))
     for k in range(steps if beta else 0):
         copy_scaled(1 / beta, v, basis + k * n, n)
         if C.exist:
@@ -248,15 +247,14 @@ def lanczos(Product F, Rows C, start, int steps):
             C.project(v, Cv)
         else:
             F.apply(basis + k * n, v)
-        diagonal[k] = over.total(dot(basis + k * n, v, n))
+        diagonal[k] = dot(basis + k * n, v, n)
         largest = fmax(largest, fabs(diagonal[k]))
         add(-diagonal[k], basis + k * n, v, n)
         if k:
             add(-beta, basis + (k - 1) * n, v, n)
         rows_times(basis, v, share, k + 1, n)
-        over.add(share, k + 1)
         add_combination(-1.0, basis, share, v, k + 1, n)
-        beta = sqrt(over.total(dot(v, v, n)))
+        beta = sqrt(dot(v, v, n))
         off[k] = beta
         kept = k + 1
         if beta <= 1e-12 * largest:
@@ -303,7 +301,6 @@ def homogenised(Product F, Rows C, q, lb, ub, diagonal, double norm):
     """
     cdef Py_ssize_t i, n = F.n, known = len(diagonal)
     cdef list owners = []
-    cdef Reduction over = F.over
     cdef Room room = Room(C.r)
     result, lower, upper = zeros(n), empty(n), empty(n)
     cdef const double *shift = C.x_tilde
@@ -322,7 +319,7 @@ def homogenised(Product F, Rows C, q, lb, ub, diagonal, double norm):
     for i in range(n):
         l[i], u[i] = low[i] - shift[i], high[i] - shift[i]
         moved |= shift[i] != 0
-    if over.any(moved):
+    if moved:
         F.apply(shift, b)
     for i in range(n):
         b[i] = -cost[i] - b[i]
@@ -331,11 +328,10 @@ def homogenised(Product F, Rows C, q, lb, ub, diagonal, double norm):
     for i in range(known):
         sums[2] += d[i]
     sums[1], sums[3] = dot(b, b, n), known
-    over.add(sums, 4)
     if sums[1] <= 1e-28 * sums[0]:
         memset(b, 0, n * sizeof(double))  # d − Fx̃ is in the range of Cᵀ up to rounding
     mean = sums[2] / fmax(sums[3], 1.0)
     if not norm > NORM_ROUNDING * mean:
         norm = mean or 1.0
     scale(1 / norm, b, n)
-    return over.vector(result), (over.vector(lower), over.vector(upper)), norm
+    return result, (lower, upper), norm

@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mortarbench.harness import QP, Discs, Status, Vector
-from mortarbench.harness.distributed.vectors import DistributedVector, distributed
 from mortarbench.harness.operators import is_semidefinite
 from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.smalbe import compiled
-from mortarbench.solvers.smalbe.compiled import Product, Reduction
+from mortarbench.solvers.smalbe.compiled import Product
 from mortarbench.solvers.smalbe.preconditioner import Preconditioner
 from mortarbench.solvers.smalbe.rows import (
     DenseRows,
@@ -115,18 +114,15 @@ def projected_problem(
 
     find : function that returns the spectrum of 𝒫F𝒫, such as `by_lanczos` or `by_power`
     """
-    over, whole = Reduction(), True
-    if isinstance(qp.q, DistributedVector):
-        over, whole = Reduction(qp.q.ranks, distributed), False
-    F = Product(qp.P, qp.q.size, over)
+    F = Product(qp.P, qp.q.size)
     discs = tuple(one for one in qp.sets if isinstance(one, Discs))
     rows: Rows
-    if (whole and not qp.b.size) or not is_sparse(qp.A):
-        rows = orthonormal_rows(qp.A, qp.b)
-    else:
+    if is_sparse(qp.A):
         lower, upper = hull(qp.sets, qp.q.size)
         rows = equality_rows(qp.A, qp.b, np.isfinite(lower) | np.isfinite(upper))
-    C, diagonal = compiled.Rows(rows, over), _diagonal(qp)
+    else:
+        rows = orthonormal_rows(qp.A, qp.b)
+    C, diagonal = compiled.Rows(rows), _diagonal(qp)
     spectrum, box = find(F, C), qp.box
     b, bounds, norm = compiled.homogenised(
         F, C, qp.q, box.lower, box.upper, diagonal, spectrum.norm

@@ -1,14 +1,14 @@
 # Proportioning with an incomplete factor of the free block of P.
 
 
-cdef double gain_of_projection(MPRGP at) except? -1:
+cdef double gain_of_projection(MPRGP at) noexcept:
     """Return a lower bound on the decrease of the cost in the step to Π(x − g/τ).
 
     With the projection Π onto the set, s = Π(x − g/τ) − x and τ ≥ ‖H‖, the bound is
     −gᵀs/2, because gᵀs ≤ −τ‖s‖².
     """
     at.set.minimise(at.x, at.g, at.B.tau, at.s, NULL)
-    return -0.5 * at.over.total(dot(at.g, at.s, at.n))
+    return -0.5 * dot(at.g, at.s, at.n)
 
 
 cdef bint step_by_factor(MPRGP at) except -1:

@@ -68,7 +68,6 @@ class SMALBE(Options):
     )
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs)
-    on_ranks: ClassVar[bool] = True  #: see `harness.processes.ranks`
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:

@@ -30,7 +30,7 @@ cdef double worst_ratio(
     )
 
 
-cdef bint scales(double *d, Py_ssize_t n, Reduction over) except -1:
+cdef bint scales(double *d, Py_ssize_t n) noexcept:
     """d ← D⁻¹ᐟ² with D from the diagonal d of P; return False if d was zero."""
     cdef Py_ssize_t i
     cdef double usual
@@ -39,21 +39,19 @@ cdef bint scales(double *d, Py_ssize_t n, Reduction over) except -1:
     for i in range(n):
         total[0] += d[i] if d[i] > 0 else 0.0
         total[1] += d[i] > 0
-    over.add(total, 2)
     usual = total[0] / total[1] if total[1] > 0 else 1.0
     for i in range(n):
         d[i] = 1 / sqrt(d[i] if d[i] > 1e-12 * usual else usual)
     return total[1] > 0
 
 
-def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
+def relative_residual(qp, s, double tol, Px, diagonal, G):
     """Return the largest error of a point within its bounds; inf if it is not finite.
 
     s : a `Solution` without multipliers of inequality rows
     tol : see `solvers.common.stopping.relative_residual`
     diagonal : diagonal of P (n,), empty for an operator without a known diagonal
-    G : the equality rows, an array or an operator
-    over : processes that share vectors (n,)
+    G : the equality rows (m, n), an array or a sparse array
     """
     cdef Py_ssize_t i, j, n = len(qp.q), m = len(s.y)
     cdef int k
@@ -78,7 +76,7 @@ def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
     cdef CompressedRows by_components  # Gᵀ
     if len(diagonal):
         memcpy(w, read(diagonal, owners), n * sizeof(double))
-    if not scales(w, n, over):
+    if not scales(w, n):
         tol = 0.0
     # 1. Gᵀy, Gx and Σ|Gᵢⱼ|wⱼ
     if isinstance(G, np.ndarray):
@@ -89,7 +87,7 @@ def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
                 size[i] += fabs(row[j]) * w[j]
             add(y[i], row, r, n)
             row += n
-    elif issparse(G):
+    else:
         by_components = transposed_rows(G)
         for i in range(n):
             for j in range(by_components.indptr[i], by_components.indptr[i + 1]):
@@ -97,10 +95,6 @@ def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
                 missed[k] += by_components.data[j] * x[i]
                 size[k] += fabs(by_components.data[j]) * w[i]
                 r[i] += by_components.data[j] * y[k]
-    elif m:
-        copy_result(G @ s.x, m, missed, "Gx")
-        copy_result(abs(G) @ over.vector(copied(w, n)), m, size, "Σ|Gᵢⱼ|wⱼ")
-        copy_result(G.T @ s.y, n, r, "Gᵀy")
     # 2. Stationarity and the gap
     sums[:] = [0.0, 0.0, 0.0, 0.0]
     most[:] = [0.0, 0.0, 0.0]
@@ -109,9 +103,6 @@ def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
         if z[i] != 0:
             sums[3] += (ub[i] if z[i] > 0 else lb[i]) * z[i]
     terms_of_test(x, Fx, q, r, w, n, sums, most)
-    over.add(sums, 4)
-    for i in range(3):
-        most[i] = -over.least(-most[i])
     for i in range(m):
         sums[3] += e[i] * y[i]
     worst = worst_ratio(sums, most, sums[0] + sums[1] + sums[3], tol)

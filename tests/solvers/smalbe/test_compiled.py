@@ -357,10 +357,9 @@ def test_the_stopping_test_is_that_of_the_other_solvers(seeds):
             G = np.ascontiguousarray(
                 qp.A.toarray() if hasattr(qp.A, "toarray") else qp.A
             )
-            alone = compiled.Reduction()
             for rows in (G, csr_array(G)):
                 found = compiled.relative_residual(
-                    qp, point, 1e-8, qp.P @ point.x, qp.P.diagonal(), rows, alone
+                    qp, point, 1e-8, qp.P @ point.x, qp.P.diagonal(), rows
                 )
                 expected = relative_residual(qp, point, 1e-8)
                 assert found == pytest.approx(expected, rel=1e-6, abs=1e-13), seed

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import no_rows
-from mortarbench.solvers.smalbe.compiled import SMALBE, Product, Reduction, Rows
+from mortarbench.solvers.smalbe.compiled import SMALBE, Product, Rows
 from mortarbench.solvers.smalbe.options import EXPANSIONS
 from mortarbench.solvers.smalbe.projected import Iterate, Projected, Spectrum
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
@@ -55,7 +55,7 @@ def run_compiled(
     )  # fmt: skip
     rows, F = orthonormal_rows(no_rows(b.size), np.zeros(0)), Product(A, b.size)
     problem = Projected(
-        F, rows, Rows(rows, Reduction()), Spectrum(unit, ritz), b / unit,
+        F, rows, Rows(rows), Spectrum(unit, ritz), b / unit,
         (lower, upper), -b, np.zeros(0),
     )  # fmt: skip
     options = SimpleNamespace(

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, random_array
 from mortarbench.harness import QP, Status, no_rows
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers.smalbe import rows as module
-from mortarbench.solvers.smalbe.compiled import Reduction, Rows
+from mortarbench.solvers.smalbe.compiled import Rows
 from mortarbench.solvers.smalbe.driver import outer_loop
 from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
 from mortarbench.solvers.smalbe.rows import (
@@ -22,7 +22,7 @@ from mortarbench.solvers.smalbe.rows import (
     sparse_rows,
 )
 from mortarbench.solvers.smalbe.solver import SMALBE
-from tests.support.textbook.rows import met, model_of
+from tests.support.textbook.rows import factor_in_face, met, model_of
 
 SEED = 20210805
 
@@ -211,7 +211,7 @@ def test_a_motion_of_fixed_components_only_leaves_a_factor(monkeypatch, border, 
     on_face = np.arange(44) >= 4
     unit = dense / np.linalg.norm(dense, axis=1)[:, None]
     t = unit[:, on_face] @ rng.normal(size=40)
-    y = rows.gram.in_face(on_face, shift)(t)
+    y = factor_in_face(rows, on_face, shift)(t)
     G_F = unit[:, on_face]
     missed = G_F @ (G_F.T @ y) + shift * (unit @ (unit.T @ y)) - t
     assert np.abs(missed).max() <= 1e-6 * np.abs(t).max()
@@ -248,6 +248,6 @@ def test_a_right_hand_side_of_rounding_size_counts_as_zero(G):
     for rows in (sparse_rows(G, e, ALL), orthonormal_rows(G, e)):
         inside = rows.project(nu) + 1e-9 * nu
         assert np.linalg.norm(G @ inside) < size
-        for rows_met in (partial(met, rows), Rows(rows, Reduction()).met):
+        for rows_met in (partial(met, rows), Rows(rows).met):
             assert rows_met(inside, 1e-8, 0.0)
             assert not rows_met(nu, 1e-8, 0.0)

@@ -13,7 +13,7 @@ from mortarbench.harness import QP, Vector
 from mortarbench.solvers.common.conversion import has_bound
 from mortarbench.solvers.smalbe import projected
 from mortarbench.solvers.smalbe import rows as given
-from mortarbench.solvers.smalbe.compiled import Product, Reduction, Rows
+from mortarbench.solvers.smalbe.compiled import Product, Rows
 from mortarbench.solvers.smalbe.projected import Spectrum, _diagonal
 from mortarbench.solvers.smalbe.rows import equality_rows, is_sparse
 from mortarbench.solvers.smalbe.spectrum import Ritz, random_start
@@ -117,7 +117,7 @@ def projected_problem(
     b = rows.project(d) / spectrum.norm
     if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
         b = np.zeros_like(b)  # b consists only of rounding errors of d
-    C = Rows(rows, Reduction())
+    C = Rows(rows)
     return Projected(F, rows, C, spectrum, b, bounds, qp.q, diagonal)
 
 

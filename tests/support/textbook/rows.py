@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
 from mortarbench.harness import Matrix, Vector
+from mortarbench.harness.distributed.sparse import BorderedFactor
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.rows import (
     RANK,
@@ -48,7 +49,7 @@ def _missed(rows: Rows, nu: Vector, Cnu: Vector) -> Vector:
     if isinstance(rows, DenseRows):
         return np.asarray(rows.GC @ Cnu)
     assert isinstance(rows, SparseRows)
-    return rows.error(nu)
+    return np.asarray(rows.G @ nu)
 
 
 def violation(rows: Rows, nu: Vector) -> float:
@@ -90,28 +91,28 @@ class PenaltyModel:
 
             Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
         """
-        rows, gram, tau, w = self.rows, self.rows.gram, self.tau, self.w
+        rows, tau, w = self.rows, self.tau, self.w
         b, G_b = rows.bounded, rows.of_bounded
         x_b, g_b, box = x[b], g[b], (bounds[0][b], bounds[1][b])
-        Gg = rows.unit @ g
+        Gg = rows.unit.transposed_times(g)
 
         def at(y: Vector) -> Tilted:
-            tilt = g_b + G_b.T @ y
+            tilt = g_b + G_b @ y
             s_b, piece = kernels.tilted_step(x_b, tilt, tau, *box)
-            held = G_b @ kernels.combined(1 / tau, tilt, 1.0, s_b)
-            shift = kernels.combined(1 / tau, Gg, 1 / tau + 1 / w, gram.product(y))
+            held = G_b.transposed_times(kernels.combined(1 / tau, tilt, 1.0, s_b))
+            shift = kernels.combined(1 / tau, Gg, 1 / tau + 1 / w, rows.matrix @ y)
             return Tilted(s_b, piece, held - shift)
 
         def newton(slope: Vector, free: Mask) -> Vector:
             of_all = np.ones(x.size, dtype=bool)
             of_all[b] = free
-            return tau * gram.in_face(of_all, tau / w)(slope)
+            return tau * factor_in_face(rows, of_all, tau / w)(slope)
 
-        found = minimised(at, newton, rows.unit.shape[0])
+        found = minimised(at, newton, rows.unit.shape[1])
         if found is None:
             return Model.of_norm(tau + w, x.size).step(x, g, bounds)
         y, there = found
-        s: Vector = kernels.combined(-1 / tau, g, -1 / tau, rows.unit.T @ y)
+        s: Vector = kernels.combined(-1 / tau, g, -1 / tau, rows.unit @ y)
         s[b] = there.s
         return s
 
@@ -134,17 +135,23 @@ class PenaltyModel:
 
     def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
         """Return v → B_FF⁻¹v_F, zero off the face F."""
-        G, solve = self.rows.unit, self.rows.gram.in_face(free, self.tau / self.w)
+        G, solve = self.rows.unit, factor_in_face(self.rows, free, self.tau / self.w)
         inverse = np.where(free, 1 / self.tau, 0.0)
 
         def apply(v: Vector) -> Vector:
             v = np.where(free, v, 0.0)
-            y = solve(G @ v)
-            if hasattr(G.T, "weighted_difference"):
-                return G.T.weighted_difference(v, y, inverse)
-            return kernels.weighted_difference(v, G.T @ y, inverse)
+            y = solve(G.transposed_times(v))
+            return kernels.weighted_difference(v, G @ y, inverse)
 
         return apply
+
+
+def factor_in_face(rows: SparseRows, free: Mask, shift: float) -> BorderedFactor:
+    """Return the factor of G_F G_Fᵀ + shift·GGᵀ, where F is `free` (n,)."""
+    if not rows.has_border:
+        return rows.factorised(free, shift)
+    active = (~np.asarray(free)[rows.bounded]).astype(float)
+    return rows.factor.shifted_without(shift, rows.of_bounded, active)
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
