@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse import csr_array
 
 from mortarbench.harness import (
     QP,
@@ -41,7 +41,6 @@ from mortarbench.harness import (
 )
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.discs import DistributedDiscs
-from mortarbench.harness.distributed.factor import Touched, local_factor, touched_rows
 from mortarbench.harness.distributed.sparse import CompressedRows, LinearMap
 from mortarbench.harness.distributed.vectors import (
     DistributedColumns,
@@ -53,7 +52,6 @@ from mortarbench.harness.distributed.vectors import (
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.operators import (
-    CONTACT_SHIFT,
     COUPLING_ROUNDING,
     DualOperator,
     Group,
@@ -437,13 +435,10 @@ class RankOperator:
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
         """Return x ↦ (B W Bᵀ)⁺x on owned rows, with a diagonal matrix W of weights.
 
-        The coupling of contact rows with equality rows is neglected, and the diagonal
-        of the contact rows is increased by the factor 1 + `CONTACT_SHIFT`.
-        Most equality rows (all of them if gluing is orthonormal and the copies of each
-        node have equal weights) are uncoupled and only require a division. The system
-        of the coupled equality rows is solved redundantly on all ranks. Contact rows
-        are coupled along the contact sides. The system of these rows is factorised in
-        distributed form, or redundantly if ranks share many of the rows.
+        The coupling of contact rows with equality rows is neglected. Most equality rows
+        (all of them if gluing is orthonormal and the copies of each node have equal
+        weights) are uncoupled and only require a division. The system of all other rows
+        is solved redundantly on all ranks.
 
         part : (t, t) contribution of the local subdomains to B W Bᵀ, which is the sum
             of the contributions of all ranks
@@ -452,13 +447,8 @@ class RankOperator:
         diagonal = halo.accumulate(part.diagonal())
         is_contact = halo.rows >= equalities
         coupled = np.isin(halo.rows, _coupled(part, halo, diagonal, ~is_contact))
-        contact = touched_rows(halo.rows[is_contact], halo.ranks)
+        coupled |= is_contact
         solves = []
-        if contact.few_shared:
-            gram_contact = csc_array(part[is_contact][:, is_contact])
-            solves.append(_distributed_inverse(gram_contact, contact, halo, diagonal))
-        else:
-            coupled |= is_contact
         if halo.ranks.extreme(float(coupled.any()), np.max):
             solves.append(_replicated_inverse(part, coupled, halo, equalities))
 
@@ -497,37 +487,6 @@ def _coupled(
     pairs, place = np.unique(np.stack([rows, columns]), axis=1, return_inverse=True)
     total = np.abs(np.bincount(place.ravel(), shares, pairs.shape[1]))
     return np.concatenate([inside, pairs[0, total > COUPLING_ROUNDING]])
-
-
-def _distributed_inverse(
-    part: csc_array, rows: Touched, halo: Halo, diagonal: Vector
-) -> tuple[Nodes, Callable[[Dense], Dense]]:
-    """Factorise B W Bᵀ, the sum of contributions of all ranks, in distributed form.
-
-    Parameters
-    ----------
-    part, rows : contribution (k, k) of this rank, and the rows that the rank touches
-    diagonal : (o,) diagonal of the sum at owned rows
-
-    Returns
-    -------
-    indices of the factorised rows among the owned rows, and the inverse on these rows
-
-    """
-    size = 1 / np.sqrt(halo.gather(diagonal)[np.searchsorted(halo.rows, rows.rows)])
-    unit = csc_array(diags_array(size) @ part @ diags_array(size))
-    unit += csc_array(diags_array(CONTACT_SHIFT * unit.diagonal()))
-    factor = local_factor(unit, rows).completed()
-    _, places, owned = np.intersect1d(
-        rows.rows, halo.rows[halo.owned], return_indices=True
-    )
-
-    def inverse(x: Dense) -> Dense:
-        t = np.zeros(rows.rows.size)
-        t[places] = size[places] * x
-        return np.asarray(factor(t))[places] * size[places]
-
-    return owned, inverse
 
 
 def _replicated_inverse(
