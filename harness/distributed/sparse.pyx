@@ -266,19 +266,6 @@ cdef class CompressedRows(LinearMap):
             self.combine(s, &v[0], t, &x[0] if self.k else NULL, &y[0])
         return product
 
-    def weighted_difference(
-        self, const double[::1] v, const double[::1] x, const double[::1] weights
-    ):
-        """Return diag(weights)(v − Mx) (n,) for v (n,), x (k,) and weights (n,)."""
-        self.expect(v.shape[0], self.n)
-        self.expect(x.shape[0], self.k)
-        self.expect(weights.shape[0], self.n)
-        product = np.empty(self.n)
-        cdef double[::1] y = product
-        if self.n:
-            self.weigh_difference(&v[0], &x[0] if self.k else NULL, &weights[0], &y[0])
-        return product
-
     def transposed_times(self, const double[::1] x):
         """Return Mᵀx (k,) for x (n,)."""
         self.expect(x.shape[0], self.n)
@@ -402,40 +389,6 @@ cdef double *resized(double *held, Py_ssize_t size) except NULL:
 # Largest relative amount by which a squared pivot may be below its lower bound, since
 # both values are rounded.
 cdef double PIVOT_TOLERANCE = 1e-3
-
-
-def factor_above(M, double share, L_0):
-    """Return L with LLᵀ = M, where M ≥ share·L₀L₀ᵀ in exact arithmetic.
-
-    L is in the lower triangle of the result; the upper triangle is not meaningful.
-    M is a difference of matrices whose norms are similar to that of L₀L₀ᵀ. If `share`
-    is smaller than the relative rounding errors of these matrices, the computed M may
-    have negative eigenvalues. In exact arithmetic, the pivots of M are at least the
-    pivots of share·L₀L₀ᵀ. If a computed pivot is smaller, the Cholesky factor is
-    discarded, and the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are
-    computed. Eigenvalues below `share` are set to `share`, and L follows from
-
-        LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
-
-    which contains no difference of matrices and therefore preserves the lower bound.
-
-    M : (k, k) symmetric
-    share : small positive factor of the lower bound
-    L_0 : (k, k) lower triangular L₀
-    """
-    cdef Py_ssize_t k = len(M)
-    L = np.array(M, dtype=np.float64, order="F")
-    cdef double[::1, :] at = L
-    cdef const double[::1, :] least = np.asfortranarray(L_0, dtype=np.float64)
-    if not k or factorised_above(&at[0, 0], k, share, &least[0, 0]):
-        return L
-    inner = blas.dtrsm(1.0, L_0, blas.dtrsm(1.0, L_0, M, lower=1).T, lower=1)
-    size, Q = eigh((inner + inner.T) / 2)
-    root = np.sqrt(np.maximum(size, share))
-    half = blas.dtrmm(1.0, L_0, Q * root, lower=1)
-    (R,) = qr(half.T, mode="r", overwrite_a=True)
-    L = np.asfortranarray(R.T)
-    return L * np.where(np.diag(L) < 0, -1.0, 1.0)
 
 
 cdef bint factorised_above(
@@ -706,50 +659,13 @@ cdef class BorderedFactor(LinearMap):
             self.backward_to(&a[0], &y[0])
         return result
 
-    def reduced(self, const double[::1] t):
-        """Return (L_aa⁻¹t_a, t_b − L_baL_aa⁻¹t_a), in the order of L."""
-        self.expect(t.shape[0], self.n)
-        result = np.empty(self.n)
-        cdef double[::1] u = result
-        if self.n:
-            self.reduce(&t[0], &u[0])
-        return result
-
-    def extended(self, const double[::1] u):
-        """Return x with L_aaᵀx_a + L_baᵀx_b = u_a and x_b = u_b, for u from `reduced`.
-        """
-        self.expect(u.shape[0], self.n)
-        result = np.empty(self.n)
-        cdef double[::1] x = result
-        if self.n:
-            memcpy(self.u, &u[0], self.n * sizeof(double))
-            self.extend(self.u, &x[0])
-        return result
-
-    @property
-    def complement(self):
-        """L_bbL_bbᵀ (b, b), the Schur complement of A on the border."""
-        cdef Py_ssize_t b = self.border
-        block = np.empty((b, b))
-        cdef double[:, ::1] at = block
-        if b:
-            memcpy(&at[0, 0], self.schur, b * b * sizeof(double))
-        return block
-
-    @property
-    def least_inner_pivot(self):
-        """Smallest diagonal entry of L_aa; inf if all rows belong to the border."""
-        cdef Py_ssize_t i
-        cdef double least = float("inf")
-        for i in range(self.inner):
-            least = min(least, sqrt(self.scale) * self.data[self.indptr[i]])
-        return least
-
     @property
     def least_pivot(self):
         """Smallest diagonal entry of L; inf for n = 0."""
         cdef Py_ssize_t i
-        cdef double least = self.least_inner_pivot
+        cdef double least = float("inf")
+        for i in range(self.inner):
+            least = min(least, sqrt(self.scale) * self.data[self.indptr[i]])
         for i in range(self.border):
             least = min(least, self.L[i * self.border + i])
         return least
@@ -758,16 +674,6 @@ cdef class BorderedFactor(LinearMap):
     def entries(self):
         """Number of stored entries of L."""
         return self.indptr[self.inner] + self.border * (self.border + 1) // 2
-
-    @property
-    def rows(self):
-        """Numbers (n,) of the rows of A, in the order of L."""
-        return np.asarray(self.arrays[0]).astype(np.int64)
-
-    @property
-    def border_rows(self):
-        """Numbers (b,) of the rows of the border, in the order of L."""
-        return self.rows[self.inner:]
 
     # changes of the border
 
@@ -790,7 +696,18 @@ cdef class BorderedFactor(LinearMap):
         return new
 
     cdef int raise_border(self, double shift) except -1:
-        """Factorise the Schur complement stored in `L` by `factor_above`."""
+        """Factorise the Schur complement M stored in `L`, despite rounding.
+
+        In exact arithmetic, M ≥ shift·L₀L₀ᵀ with the factor L₀ of `whole`. Since M is a
+        difference of matrices whose norms are similar to that of L₀L₀ᵀ, the computed M
+        may have negative eigenvalues. Therefore, eigenvalues of L₀⁻¹ML₀⁻ᵀ = QλQᵀ below
+        `shift` are set to `shift`, and L follows from
+
+            LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
+
+        which contains no difference of matrices and therefore preserves the lower
+        bound.
+        """
         cdef Py_ssize_t i, j, b = self.border
         M, L_0 = np.empty((b, b), order="F"), np.zeros((b, b), order="F")
         cdef double[::1, :] at = M
@@ -800,7 +717,13 @@ cdef class BorderedFactor(LinearMap):
                 at[i, j] = self.L[j * b + i]
             for i in range(j, b):
                 lower[i, j] = self.whole.L[j * b + i]
-        cdef const double[::1, :] L = np.asfortranarray(factor_above(M, shift, L_0))
+        inner = blas.dtrsm(1.0, L_0, blas.dtrsm(1.0, L_0, M, lower=1).T, lower=1)
+        size, Q = eigh((inner + inner.T) / 2)
+        half = blas.dtrmm(1.0, L_0, Q * np.sqrt(np.maximum(size, shift)), lower=1)
+        (R,) = qr(half.T, mode="r", overwrite_a=True)
+        cdef const double[::1, :] L = np.asfortranarray(
+            R.T * np.where(np.diag(R) < 0, -1.0, 1.0)
+        )
         for j in range(b):
             for i in range(j, b):
                 self.L[j * b + i] = L[i, j]
@@ -820,22 +743,13 @@ cdef class BorderedFactor(LinearMap):
         finally:
             free(block)
 
-    def shifted(self, double shift, block):
-        """Return the factor of (1 + shift)A minus a symmetric block on the border.
-
-        In exact arithmetic, the difference must be at least shift·A. The computed
-        pivots satisfy the resulting lower bounds despite rounding, see `factor_above`.
-
-        block : (b, b) matrix, in the order of `border_rows`
-        """
-        cdef const double[:, ::1] less = np.ascontiguousarray(block, dtype=np.float64)
-        self.expect(less.shape[0], self.border)
-        return self.less(shift, &less[0, 0] if self.border else NULL)
-
     def shifted_without(
         self, double shift, CompressedRows columns, const double[::1] removed
     ):
-        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ, see `shifted`.
+        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ.
+
+        In exact arithmetic, the difference must be at least shift·A. The computed
+        pivots satisfy the resulting lower bounds despite rounding.
 
         columns : matrix whose rows are the mᵢ (n,), with entries on the border only
         removed : weights wᵢ, each 0 or 1

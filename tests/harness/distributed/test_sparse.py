@@ -22,15 +22,13 @@ def test_products_are_those_of_the_dense_matrix(shape):
     n, k = shape
     rng = np.random.default_rng(n + 10 * k)
     M = csr_array(random_array(shape, density=0.4, rng=rng))
-    x, v, weights = rng.standard_normal(k), *rng.standard_normal((2, n))
+    x, v = rng.standard_normal(k), rng.standard_normal(n)
     rows, dense = CompressedRows(M), M.toarray()
 
     assert rows.shape == shape
     assert rows @ x == pytest.approx(dense @ x)
     assert rows.transposed_times(v) == pytest.approx(dense.T @ v)
     assert rows.combined(2.0, v, -3.0, x) == pytest.approx(2 * v - 3 * (dense @ x))
-    found = rows.weighted_difference(v, x, weights)
-    assert found == pytest.approx(weights * (v - dense @ x))
 
 
 def test_other_formats_and_vectors_are_refused():
@@ -44,7 +42,6 @@ def test_other_formats_and_vectors_are_refused():
         lambda: rows.transposed_times(short),
         lambda: rows.combined(1.0, short, 1.0, fit),
         lambda: rows.combined(1.0, fit, 1.0, short),
-        lambda: rows.weighted_difference(fit, fit, short),
     ):
         with pytest.raises(ValueError, match="2 components; expected 3"):
             product()
@@ -137,15 +134,6 @@ def test_a_factor_with_a_border_solves(last):
     assert L(np.eye(36)) == pytest.approx(inverse)
     assert L.backward(L.forward(t)) == pytest.approx(inverse @ t)
     assert L.forward(t) @ L.forward(t) == pytest.approx(t @ inverse @ t)
-    assert L.border_rows.tolist() == list(last)
-    inner = np.setdiff1d(np.arange(36), border)
-    schur = dense[border][:, border] - dense[border][:, inner] @ np.linalg.solve(
-        dense[inner][:, inner], dense[inner][:, border]
-    )
-    assert L.complement == pytest.approx(schur)
-    u = L.reduced(t)
-    u[inner.size :] = np.linalg.solve(schur, u[inner.size :])
-    assert L.extended(u) == pytest.approx(inverse @ t)
     # the squared pivots are between the extreme eigenvalues
     least, largest = np.linalg.eigvalsh(dense)[[0, -1]]
     assert least <= L.least_pivot**2 <= largest
@@ -164,17 +152,13 @@ def test_changes_of_the_border_are_changes_of_the_matrix(shift):
     G, border = np.hstack([free, held]), np.array([4, 1])
     L = bordered_factor(csc_array(G @ G.T), border)
     columns = CompressedRows(csr_array(held.T))
-    block = (held @ held.T)[np.ix_(L.border_rows, L.border_rows)]
     expected = free @ free.T + shift * G @ G.T
     t = free @ rng.standard_normal(12)
 
-    for changed in (
-        L.shifted(shift, block),
-        L.shifted_without(shift, columns, np.ones(4)),
-    ):
-        y = changed(t)
-        assert expected @ y == pytest.approx(t, abs=1e-10)
-        assert changed.backward(changed.forward(t)) == pytest.approx(y, abs=1e-10)
+    changed = L.shifted_without(shift, columns, np.ones(4))
+    y = changed(t)
+    assert expected @ y == pytest.approx(t, abs=1e-10)
+    assert changed.backward(changed.forward(t)) == pytest.approx(y, abs=1e-10)
     one = np.array([0.0, 1, 0, 0])
     some = (1 + shift) * (G @ G.T) - np.outer(held[:, 1], held[:, 1])
     y = L.shifted_without(shift, columns, one)(some @ t)

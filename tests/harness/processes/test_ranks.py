@@ -1,13 +1,11 @@
 """Solves on several MPI ranks, compared with one process; failures of ranks."""
 
-import json
 import os
 import signal
 import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +20,7 @@ from mortarbench.harness.files.store import load_solution
 from mortarbench.harness.record import Record
 from mortarbench.harness.solution import Status
 from mortarbench.registries import Registries
-from tests.support import ROOT, SUPPORT
+from tests.support import ROOT
 from tests.support.hexahedra import TETRAHEDRA
 from tests.support.press import described
 from tests.support.solid_blocks import TOML, solid_blocks
@@ -30,87 +28,10 @@ from tests.support.waiting import soon
 
 pytestmark = pytest.mark.together
 
-CASES = (
-    "beam-ring/Nr=4/Nh=3/feti=4/dual",
-    "membranes/S=2/n=4/glue=redundant/dual",
-    "contact-patch/lower=4/upper=4/friction=tresca/bound=1e5/feti=2/dim=3/dual",
-)
 CASE = "membranes/S=2/n=4/dual"
 SOLVE = ["solve", CASE, "--solver", "smalbe"]
 TOL = 1e-8
 LANCZOS = 8  #: largest number of products with F before the solve
-#: the first case is slow, since the third also has contact between subdomains
-PARAMS = [pytest.param(case, marks=pytest.mark.slow) for case in CASES[:1]] + [
-    *CASES[1:]
-]
-
-
-@cache
-def on_ranks(ranks, cases):
-    """Return results of several ranks on vectors and on duals."""
-    done = subprocess.run(
-        [
-            mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
-            str(SUPPORT / "on_ranks.py"), *cases,
-        ],
-        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-@pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
-def ranks(request):
-    """Return the number of ranks."""
-    return request.param
-
-
-@pytest.fixture
-def rank_results(ranks):
-    """Return results of several ranks on vectors."""
-    return on_ranks(ranks, CASES[1:])
-
-
-@pytest.fixture
-def of(ranks, case):
-    """Return results of several ranks on the dual of a case."""
-    return on_ranks(ranks, CASES[:1] if case in CASES[:1] else CASES[1:])[case]
-
-
-def test_reductions_of_distributed_vectors_are_those_of_the_whole(rank_results):
-    for name, (got, known) in rank_results["vectors"]["pairs"].items():
-        assert got == pytest.approx(known, abs=1e-12), name
-
-
-def test_operations_on_a_slice_alone_are_refused(rank_results):
-    assert rank_results["vectors"]["answered"] == []
-    assert rank_results["vectors"]["kept"]
-
-
-def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(rank_results):
-    for error, refused, shared in rank_results["factors"]:
-        assert error < 1e-12
-        assert refused  # raised on all ranks, although only one has dependent rows
-        assert shared == list(range(0, 24, 3))
-
-
-@pytest.mark.parametrize("case", PARAMS)
-def test_ranks_multiply_and_precondition_as_one_process_does(of):
-    for errors in of["errors"]:
-        assert max(errors.values()) < 1e-13, errors
-
-
-@pytest.mark.parametrize("case", PARAMS)
-def test_every_row_has_one_owner_and_no_rank_has_far_more_than_its_share(of):
-    assert sum(of["rows"]) == of["size"]
-    assert max(of["subdomains"]) <= 1.5 * np.mean(of["subdomains"])
-
-
-@pytest.mark.parametrize("case", PARAMS)
-def test_the_solution_on_ranks_is_that_of_one_process(of):
-    assert of["status"] == ["solved", "solved"]
-    assert of["difference"] < 10 * TOL
-    assert of["same_active"]
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +161,7 @@ def test_friction_on_metis_parts_has_the_same_displacement_on_ranks(tmp_path):
             assert answer.record.quantities[state] == alone.record.quantities[state]
 
 
-@pytest.mark.slow  # a fast test has dependent rows on ranks, in a case of `CASES`
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [6, 20])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
     """Node-to-segment rows do not resist rolling, so the equality rows are

@@ -6,11 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, InputError, Solution, Status, no_rows
-from mortarbench.harness.distributed import factor
-from mortarbench.harness.distributed.factor import touched_rows
 from mortarbench.problems.feti import distributed as over_ranks
 from mortarbench.problems.feti.distributed import (
     BLOCK_SHARE,
@@ -229,37 +227,6 @@ def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
         assert at.ghosts.size == at.rows.size - at.owned.size
 
 
-@pytest.mark.parametrize("fill", [0, 10**6])
-def test_contact_rows_are_inverted_in_distributed_or_replicated_form(
-    torn, fill, monkeypatch
-):
-    """In both forms, the sum of B W Bᵀ over all ranks is inverted."""
-    monkeypatch.setattr(factor, "MAX_FILL", fill)
-    F, qp = dual_of(torn)
-    x = np.random.default_rng(6).standard_normal(qp.q.size)
-    known = F.preconditioner("dirichlet", "stiffness")(x)
-    ways = []
-    for name in ("_distributed_inverse", "_replicated_inverse"):
-        way = getattr(over_ranks, name)
-
-        def noted(*args, name=name, way=way):
-            ways.append(name)
-            return way(*args)
-
-        monkeypatch.setattr(over_ranks, name, noted)
-
-    def work(ranks):
-        P = local_share(qp, F, ranks).qp.P
-        own = P.halo.rows[P.halo.owned]
-        found = np.asarray(P.preconditioner("dirichlet", "stiffness")(x[own]))
-        assert_allclose(found, known[own], atol=1e-7 * np.abs(known).max())
-
-    on_threads(3, work)
-    assert ("_distributed_inverse" in ways) == (fill > 0)
-    if not fill:
-        assert "_replicated_inverse" in ways
-
-
 def test_rows_are_owned_in_turn_by_the_ranks_that_touch_them():
     reach = csr_array(np.array([[1, 0, 1], [0, 1, 0], [1, 1, 1], [1, 1, 1], [1, 0, 1]]))
     rows = np.array([4, 5, 6, 7, 9])
@@ -463,62 +430,23 @@ def test_rows_are_coupled_if_the_sum_over_ranks_exceeds_rounding():
     assert set(np.concatenate(on_threads(2, work)).tolist()) == {1, 2, 3, 9}
 
 
-def summed(decades=0):
-    """Return masks of 14 rows on three ranks, lengths of the rows, and summands."""
+def summed():
+    """Return masks of 14 rows on three ranks, and summands."""
     rng = np.random.default_rng(0)
     here = np.zeros((3, 14), dtype=bool)
     for p in range(3):
         here[p, 4 * p : 4 * p + 6] = True
-    length = 10.0 ** rng.uniform(-decades, decades, 14)
-    length[[4, 9]], length[[5, 8]] = 0.1**decades, 10.0**decades  # shared rows
     parts = []
     for on in here:
         G = rng.standard_normal((14, 20)) * on[:, None]
-        parts.append(np.outer(length, length) * (G @ G.T))
-    return here, length, parts
-
-
-def test_the_sum_of_parts_is_inverted_rank_by_rank():
-    here, length, parts = summed(decades=6)
-    x = length * np.random.default_rng(1).standard_normal(14)
-    known = np.linalg.solve(sum(parts) / np.outer(length, length), x / length)
-
-    def work(ranks):
-        at = halo_of(ranks, here)
-        rows = touched_rows(at.rows, ranks)
-        part = csc_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
-        owned, inverse = over_ranks._distributed_inverse(
-            part, rows, at, at.accumulate(part.diagonal())
-        )
-        own = at.rows[at.owned]
-        assert owned.tolist() == list(range(own.size))
-        assert length[own] * inverse(x[own]) == pytest.approx(known[own], rel=1e-5)
-        return True
-
-    assert all(on_threads(3, work))
-
-
-def test_equal_contact_rows_are_inverted_to_rounding():
-    """One row is repeated, so that only the sum of the first two unknowns is
-    determined."""
-    here = np.ones((1, 3), dtype=bool)
-    A = np.array([[2.0, 2, 0], [2, 2, 0], [0, 0, 5]])
-
-    def work(ranks):
-        at = halo_of(ranks, here)
-        rows = touched_rows(at.rows, ranks)
-        _, inverse = over_ranks._distributed_inverse(
-            csc_array(A), rows, at, np.diag(A).copy()
-        )
-        return A @ inverse(np.array([1.0, 1, 1]))
-
-    assert on_threads(1, work)[0] == pytest.approx([1, 1, 1], abs=1e-6)
+        parts.append(G @ G.T)
+    return here, parts
 
 
 def test_the_sum_of_parts_on_selected_rows_is_inverted_on_all_ranks():
     """Couplings with unselected rows, and of equality with contact rows, are
     dropped."""
-    here, _, parts = summed()
+    here, parts = summed()
     some, first = np.array([0, 3, 4, 5, 8, 9, 12]), 5  # three equations
     A = sum(parts)[np.ix_(some, some)]
     A[:3, 3:] = A[3:, :3] = 0
