@@ -259,8 +259,8 @@ class Case:
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: elastic problem, needed to certify errors
     #: maps a solution of the QP to the data of its certificate, if bodies are only
-    #: known by their subdomains: bodies, displacement, and multipliers of contact and of
-    #: friction with positive bounds
+    #: known by their subdomains: bodies, displacement, and multipliers of contact and
+    #: of friction with positive bounds
     certifiable: (
         Callable[[Solution], tuple[DecomposedMechanics, Vector, Vector]] | None
     ) = None

@@ -41,7 +41,7 @@ from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.plugin import Case, CaseOnRanks, Solver
 from mortarbench.harness.processes import reaper
-from mortarbench.harness.qp import QP, no_rows
+from mortarbench.harness.qp import QP
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import memory_mib
 from mortarbench.harness.verify.verdicts import evaluated, judgement
@@ -281,7 +281,7 @@ class RanksAsOne:
     def qp(self) -> QP:
         """The QP that the ranks have built, or an empty QP after a failure."""
         if self.host.case is None:
-            return QP(P=np.zeros((0, 0)), q=np.zeros(0), A=no_rows(0), b=np.zeros(0))
+            return QP.from_arrays(np.zeros((0, 0)), np.zeros(0))
         return self.host.case.qp
 
     def reported(self) -> dict[str, float]:

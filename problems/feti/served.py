@@ -37,6 +37,10 @@ class Served:
     #: map from a displacement (n,) to the largest stress of each body on this rank
     stresses: Callable[[Vector], Vector] | None = None
 
+    def __post_init__(self) -> None:
+        """Let the ranks agree on their subdomains."""
+        _ = self.torn.domains
+
     @property
     def domains(self) -> Subdomains:
         """The subdomains without eliminated components."""

@@ -79,16 +79,22 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     if form == "primal":
         return _case(pair, primal_form(pair.qp))
     start = perf_counter()
-    served = Served(TornBodies(pair.in_subdomains(p["glue"])))
+    served = Served(TornBodies(in_subdomains(params)))
     case = _decomposed(pair, served, Lead(SERIAL, served))
     return replace(case, dualise_seconds=perf_counter() - start)
+
+
+def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
+    """Return the decomposed problem for `params`, which must contain all keys."""
+    p: Any = params
+    return Membranes(p["S"], p["n"]).in_subdomains(p["glue"])
 
 
 def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
     """Build the dual on several ranks; `params` must contain all keys."""
     p: Any = params
     pair = Membranes(p["S"], p["n"])
-    served = Served(TornBodies(pair.in_subdomains(p["glue"]), comm))
+    served = Served(TornBodies(in_subdomains(params), comm))
     return CaseOnRanks(
         served, digest_of(served.torn), partial(_decomposed, pair, served)
     )
