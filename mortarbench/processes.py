@@ -37,13 +37,13 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     ranks = this_rank() if request.get("ranks", 1) > 1 else None
 
     def emit(case: Mapping[str, Any], ranks: Ranks) -> DistributedQP:
-        from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+        from mortarbench.solvers.reference.operators import reference_of_operator
 
         family = registries.families[case["family"]]
         emission = family.emission(case["form"], case["params"])
         if emission is None:
             raise InputError(f"{family.name}: ranks cannot assemble this case")
-        return emission(ranks, reference_over_ranks)
+        return emission(ranks, reference_of_operator)
 
     serve(
         solver,
