@@ -41,7 +41,7 @@ def distributed(name: str = CASE) -> None:
     from mortarbench.harness.distributed.vectors import Ranks
     from mortarbench.problems.feti import distributed_dual
     from mortarbench.problems.models import beam_ring, membranes, patch, plate
-    from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+    from mortarbench.solvers.reference.operators import reference_of_operator
     from mortarbench.solvers.smalbe.solver import SMALBE
 
     del distributed_dual, beam_ring, membranes, patch, plate
@@ -63,7 +63,7 @@ def distributed(name: str = CASE) -> None:
     emit = case.family.emission(case.form, case.params)
     if emit is None:
         raise SystemExit(f"{name}: ranks cannot assemble this case")
-    share_source = emit(ranks, reference_over_ranks)
+    share_source = emit(ranks, reference_of_operator)
     if ranks.rank == 0:
         print(f"{name}: {share_source.variables} multipliers, {ranks.size} ranks")
     print_stage("emit", start)

@@ -264,6 +264,9 @@ class Case:
     certifiable: (
         Callable[[Solution], tuple[DecomposedMechanics, Vector, Vector]] | None
     ) = None
+    #: digest of the QP, if its coefficients have rounding errors that depend on the
+    #: number of ranks; empty to compute it from the coefficients
+    digest: str = ""
     remarks: tuple[str, ...] = ()  #: warnings about the input; each is a single line
     #: relative residual of the fixed-point iteration to which the QP belongs, such as
     #: the iteration for Coulomb's law. An accurate solution of this QP does not reduce
@@ -275,7 +278,6 @@ class CaseOnRanks(NamedTuple):
     """A case that several ranks have built together."""
 
     served: Any  #: objects on this rank whose methods rank 0 calls on all ranks
-    digest: str  #: digest of the QP, independent of the number of ranks
     #: returns the case on rank 0, while the other ranks serve
     case: Callable[[Lead], Case]
 

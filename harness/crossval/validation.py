@@ -22,7 +22,6 @@ from mortarbench.harness.crossval.comparison import (
     compare_answers,
 )
 from mortarbench.harness.crossval.ground_truth import StoredAnswer
-from mortarbench.harness.distributed.vectors import DISTRIBUTED_DIGEST
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import (
@@ -268,12 +267,14 @@ def _built(
                 cases[name] = rebuild(
                     answered[0], folder.path, folder.families, folder.reference
                 )
-                known = None, qp_digest(cases[name].qp, serialised=True)
+                built = cases[name]
+                now = built.digest or qp_digest(built.qp, serialised=True)
+                known = None, now
         except InputError as e:
             lost += [_listed(r, str(e)) for r in answered]
             mine = [r for r in mine if not (r.vectors or _is_proven(r))]
         for r in mine:
-            if not known or r.qp in known or f"{r.qp}".startswith(DISTRIBUTED_DIGEST):
+            if not known or r.qp in known:
                 same.append(r)
             else:
                 text = (

@@ -52,5 +52,7 @@ def ranks_asked(count: object, where: str) -> int:
 def too_few_parts(parts: int, ranks: int) -> str:
     """Return the message for a case that so many ranks cannot build together."""
     if parts == 1:
-        return "the case is not in subdomains; expected one rank, or a dual in subdomains"
+        return (
+            "the case is not in subdomains; expected one rank, or a dual in subdomains"
+        )
     return f"{ranks} ranks for {parts} subdomains; expected at most one rank for each"

@@ -186,7 +186,8 @@ class CaseWorker:
             "scale": case.scale,
             "constant": case.constant,
         }
-        digest = save_qp(path, case.qp, plain(meta), serialised=True)
+        saved = save_qp(path, case.qp, plain(meta), serialised=True)
+        digest = case.digest or saved
         seconds = {
             "build_seconds": self._build_seconds,
             "dualise_seconds": case.dualise_seconds,

@@ -276,8 +276,8 @@ def measure_once(
         if source is not Source.RANKS:
             qp_file = scratch / "qp.npz"
             meta = {"name": record.case}
-            digest = save_qp(qp_file, case().qp, meta, serialised=True)
-            record = record.replace(qp=digest)
+            saved = save_qp(qp_file, case().qp, meta, serialised=True)
+            record = record.replace(qp=case().digest or saved)
             if not source.is_shared:
                 request |= {"qp": str(qp_file), "digest": content_digest(qp_file)}
         once = partial(

@@ -218,21 +218,20 @@ class Host:
         self.case: Case | None = None
         self.failure: Exception | None = None
 
-    def build(self, case: Mapping[str, Any]) -> str:
-        """Build a case; return the digest of its QP, or "" after a failure."""
+    def build(self, case: Mapping[str, Any]) -> None:
+        """Build a case together with the other ranks."""
         self.served = self.case = self.failure = None  # free memory first
         try:
             built = self.comm.together(lambda: self._build(case, self.comm))
         except (InputError, RankFailedError) as e:  # all ranks raise the same error
             self.failure = e
-            return ""
+            return
         except Exception as e:
             self.failure = RankFailedError(in_a_line(e))
-            return ""
+            return
         self.served = built.served
         if not self.comm.rank:
             self._case = built.case
-        return built.digest
 
     def finish(self) -> None:
         """Complete the case on rank 0, which calls methods of all ranks."""
@@ -256,7 +255,7 @@ class RanksAsOne:
         slowest rank, in s. They are empty after a failure.
         """
         start, host = time.perf_counter(), self.host
-        digest = self._lead("build", dict(case))
+        self._lead("build", dict(case))
         if host.failure is not None:
             return {}
         try:
@@ -267,7 +266,7 @@ class RanksAsOne:
         assert host.case is not None
         return {
             "sizes": host.case.qp.sizes,
-            "qp": digest,
+            "qp": host.case.digest,
             "build_seconds": time.perf_counter() - start,
         }
 

@@ -181,6 +181,12 @@ class LoadPath(Generic[P]):
         """Return the number of iterates of a load step; 1 without Coulomb's law."""
         return len(self.problems(self.last_of(step)))
 
+    def before(self, step: int, chosen: Iterate[P]) -> int:
+        """Return the number of problems that precede an iterate of a load step."""
+        last = self.last_of(step)
+        index = self.problems(last).index(chosen)
+        return sum(len(self.problems(i)) for i in range(last)) + index
+
     def last_of(self, step: int) -> int:
         """Return the index (0, 1, …) of the last stage of a load step."""
         return max(i for i, stage in enumerate(self.stages) if stage.step == step)

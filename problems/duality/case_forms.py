@@ -28,14 +28,19 @@ from mortarbench.problems.contact.balance import least_motion
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
 from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.contact.stepping import Iterate
 from mortarbench.problems.duality.decomposed import cached_layout, decompose
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise, primal_form
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
+    digest_of,
     feti_dual,
     feti_matrices,
 )
-from mortarbench.problems.duality.monolithic import monolithic_path
+from mortarbench.problems.duality.monolithic import (
+    MonolithicLinearisation,
+    monolithic_path,
+)
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
@@ -62,16 +67,16 @@ def case_of(
     form : one of FORMS
     """
     elastic = problem.bodies
-    path, decomposed = monolithic_path(problem, reference), None
-    whole, friction, _ = path.problem(choice.step, choice.iterate)
+    path, decomposed, digest = monolithic_path(problem, reference), None, ""
+    chosen = path.problem(choice.step, choice.iterate)
+    whole, friction, _ = chosen
     primal, count = whole.primal, path.iterates(choice.step)
     if choice.size:
-        rows, c = contact_rows(primal, friction)
-        contact = Contact(rows, c, friction.bound, friction.tangents)
-        stage = problem.stages[path.last_of(choice.step)]
-        layout = cached_layout(elastic, choice.size)
-        parts = decompose(elastic, layout, choice.glue, stage, contact)
-        decomposed = Served(TornBodies(parts))
+        decomposed = _torn(problem, choice, path.last_of(choice.step), chosen)
+        others, first = path.before(choice.step, chosen), decomposed
+        if others:
+            first = _torn(problem, choice, 0, path.problems(0)[0])
+        digest = digest_of(first.torn, Lead(SERIAL, first), others)
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
@@ -93,7 +98,27 @@ def case_of(
         friction=friction,
         settle=lambda s: least_motion(bodies.rigid, primal, s, friction),
     )
+    case = replace(case, digest=digest)
     return case if problem.exact is None else with_exact_tractions(case, problem.exact)
+
+
+def _torn(
+    problem: ContactProblem,
+    choice: Choice,
+    stage: int,
+    linearised: Iterate[MonolithicLinearisation],
+) -> Served:
+    """Return the subdomains with the rows of a problem that was linearised.
+
+    stage : number of the stage of the problem
+    """
+    elastic, friction = problem.bodies, linearised.friction
+    rows, c = contact_rows(linearised.problem.primal, friction)
+    contact = Contact(rows, c, friction.bound, friction.tangents)
+    layout = cached_layout(elastic, choice.size)
+    of_stage = problem.stages[stage]
+    parts = decompose(elastic, layout, choice.glue, of_stage, contact)
+    return Served(TornBodies(parts))
 
 
 def with_exact_tractions(case: Case, exact: NDArray[np.float64]) -> Case:

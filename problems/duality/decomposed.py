@@ -179,9 +179,8 @@ def case_on_ranks(
         )
     path = decomposed_path(problem, choice, comm, reference)
     chosen = path.problem(choice.step, choice.iterate)
-    last = path.last_of(choice.step)
-    problems = path.problems(last)
-    others = sum(len(path.problems(i)) for i in range(last)) + problems.index(chosen)
+    others = path.before(choice.step, chosen)
+    count = path.iterates(choice.step)
     torn = chosen.problem.served.torn.with_bound(chosen.friction.bound)
     served = Served(torn, partial(largest_stresses, torn, problem.bodies))
     first = path.problems(0)[0].problem.served.torn if others else torn
@@ -193,7 +192,7 @@ def case_on_ranks(
         acts = np.append(np.ones(sides.c.size), bound) > 0
 
         def quantities(s: Solution) -> Mapping[str, Any]:
-            state = TornSolution(dual, s, sides, elastic, len(problems))
+            state = TornSolution(dual, s, sides, elastic, count)
             return {
                 **_quantities(problem, state),
                 **decomposition_quantities(served, dual.qp),
@@ -201,6 +200,7 @@ def case_on_ranks(
 
         return Case(
             qp=dual.qp,
+            digest=digest_of(first, lead, others),
             recover=lambda s: dual.displacement(s) * elastic.length,
             quantities=quantities,
             certifiable=lambda s: (
@@ -210,7 +210,7 @@ def case_on_ranks(
             ),
         )
 
-    return CaseOnRanks(served, digest_of(first, others), case)
+    return CaseOnRanks(served, case)
 
 
 def decompose(

@@ -132,23 +132,20 @@ def feti_dual(
     return Transformed(dual.qp, recover, -1.0, constant, dual.displacement)
 
 
-def digest_of(torn: TornBodies, others: int = 0) -> str:
+def digest_of(torn: TornBodies, lead: Lead, others: int = 0) -> str:
     """Return a digest of the dual that does not depend on the number of ranks.
 
     The rounding of q depends on the number of ranks. Therefore the digest contains the
     classes of the subdomains, B, c, f and the friction bounds instead. If the dual
     follows from solutions of `others` previous problems, which have rounding errors
-    too, it contains the data of the first of these problems and their number. All
-    ranks must call this function together.
+    too, it contains the data of the first of these problems and their number.
+
+    torn : bodies of the first problem
     """
-    domains, (B, c, _) = torn.domains, torn.rows
-    own = {k: domains.template(k).name for k, _ in domains.own}
-    names = {k: name for one in torn.comm.gather(own) for k, name in one.items()}
-    arrays = (domains.class_of, B.indptr, B.indices, B.data, c, torn.f)
-    text = (names[k].encode() for k in sorted(names))
-    data = (x.tobytes() for x in (*arrays, torn.problem.contact.bound))
-    digest = hex_digest((*text, *data, str(others).encode()), 64)
-    return torn.comm.bcast(digest)
+    (B, c, _), bound = torn.rows, torn.problem.contact.bound
+    arrays = (torn.domains.class_of, B.indptr, B.indices, B.data, c, torn.f, bound)
+    data = (x.tobytes() for x in arrays)
+    return hex_digest((*lead("domains.names"), *data, str(others).encode()), 16)
 
 
 def feti_matrices(served: Served, dual: QP) -> dict[str, Any]:

@@ -225,6 +225,12 @@ class Subdomains:
         modes = self.comm.bcast(modes)
         return np.concatenate([[0], np.cumsum(modes[self.class_of])])
 
+    def names(self) -> list[bytes]:
+        """Return the digests of all classes."""
+        own = {k: self.template(k).name.encode() for k, _ in self.own}
+        every = {k: name for one in self.comm.gather(own) for k, name in one.items()}
+        return [every[k] for k in sorted(every)]
+
     def kernel(self) -> csr_array:
         """Return R = diag(R_1 … R_S) (N, r), the rigid motions of all subdomains."""
         blocks = self.comm.gather({k: self.template(k).R for k, _ in self.own})

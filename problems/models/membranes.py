@@ -95,9 +95,7 @@ def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
     p: Any = params
     pair = Membranes(p["S"], p["n"])
     served = Served(TornBodies(in_subdomains(params), comm))
-    return CaseOnRanks(
-        served, digest_of(served.torn), partial(_decomposed, pair, served)
-    )
+    return CaseOnRanks(served, partial(_decomposed, pair, served))
 
 
 def _decomposed(pair: Membranes, served: Served, lead: Lead) -> Case:
@@ -107,6 +105,7 @@ def _decomposed(pair: Membranes, served: Served, lead: Lead) -> Case:
     sizes = decomposition_quantities(served, new.qp)
     return replace(
         case,
+        digest=digest_of(served.torn, lead),
         quantities=lambda s: {**case.quantities(s), **sizes},
         matrices=feti_matrices(served, new.qp) if served.torn.comm.size == 1 else {},
     )

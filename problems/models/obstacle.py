@@ -110,9 +110,7 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
 def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
     """Build the dual on several ranks; `params` must contain all keys."""
     served = Served(TornBodies(in_subdomains(params), comm))
-    return CaseOnRanks(
-        served, digest_of(served.torn), partial(_decomposed, params, served)
-    )
+    return CaseOnRanks(served, partial(_decomposed, params, served))
 
 
 def _decomposed(params: Mapping[str, Any], served: Served, lead: Lead) -> Case:
@@ -121,7 +119,11 @@ def _decomposed(params: Mapping[str, Any], served: Served, lead: Lead) -> Case:
     new = feti_dual(served, problem.qp, lead=lead)
     case = _case(params, problem, new, torn_mechanics(served, lead, problem.qp.P))
     sizes = decomposition_quantities(served, new.qp)
-    return replace(case, quantities=lambda s: {**case.quantities(s), **sizes})
+    return replace(
+        case,
+        digest=digest_of(served.torn, lead),
+        quantities=lambda s: {**case.quantities(s), **sizes},
+    )
 
 
 def _case(

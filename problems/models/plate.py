@@ -112,9 +112,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
     """Build the dual on several ranks; `params` must contain all keys."""
     served = Served(TornBodies(in_subdomains(params), comm))
-    return CaseOnRanks(
-        served, digest_of(served.torn), partial(_decomposed, params, served)
-    )
+    return CaseOnRanks(served, partial(_decomposed, params, served))
 
 
 def _decomposed(params: Mapping[str, Value], served: Served, lead: Lead) -> Case:
@@ -128,6 +126,7 @@ def _decomposed(params: Mapping[str, Value], served: Served, lead: Lead) -> Case
     sizes = decomposition_quantities(served, new.qp)
     return replace(
         case,
+        digest=digest_of(served.torn, lead),
         quantities=lambda s: {**case.quantities(s), **conditions(), **sizes},
         matrices=feti_matrices(served, new.qp) if served.torn.comm.size == 1 else {},
     )

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness import InputError, Record, Verdict
-from mortarbench.harness.distributed.vectors import DISTRIBUTED_DIGEST
 from mortarbench.harness.errors import say, some
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.record import PROVEN, VERIFIED_FACTOR
@@ -349,18 +348,16 @@ def _one_qp_per_name(records: list[Record]) -> list[Record]:
 
     A name denotes several QPs if a default, a file or a plug-in changed between two
     sessions. Rounding errors, and hence digests, differ between environments, which
-    have separate tables. Ranks compute the digest of a QP in another way, so that their
-    digests are compared with each other only.
+    have separate tables.
     """
-    digests: dict[tuple[str, str, bool], dict[str, None]] = {}
+    digests: dict[tuple[str, str], dict[str, None]] = {}
     named = []
     for r in records:
         if r.qp is not None:
-            by_ranks = r.qp.startswith(DISTRIBUTED_DIGEST)
-            known = digests.setdefault((r.environment, r.case, by_ranks), {})
+            known = digests.setdefault((r.environment, r.case), {})
             known[r.qp] = None
             if r.qp != next(iter(known)):
-                mark = r.qp.removeprefix(DISTRIBUTED_DIGEST)[:_MARK_DIGITS]
+                mark = r.qp[:_MARK_DIGITS]
                 physical = r.case.removesuffix(f"/{r.form}")
                 r = r.replace(
                     case=f"{physical}/QP={mark}{r.case.removeprefix(physical)}",

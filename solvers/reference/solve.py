@@ -12,6 +12,9 @@ are then solved with refinement in extended precision (`polish`). The result is 
 point with the smallest KKT residual of the original QP. The residual is an argument,
 so that the harness can choose among the points by its own rule.
 
+If P is an operator with preconditioners and the QP is too large to assemble P, its
+active sets are found with conjugate gradients on faces (`operators`).
+
 If the sets are bounds and discs, a method that uses projections (`projection`) refines
 the point of the interior-point method. QPs with other sets are solved by the projection
 method alone.
@@ -34,6 +37,7 @@ from mortarbench.harness.sets.blocks import Blocks
 from mortarbench.solvers.common.stopping import relative_residual
 from mortarbench.solvers.reference.equilibrate import equilibrate
 from mortarbench.solvers.reference.interior import DELTA, interior_point
+from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.polish import polish
 from mortarbench.solvers.reference.projection import projection_iterates, refine
 
@@ -76,8 +80,8 @@ def reference_solution(qp: QP, residual: Residual = _relative) -> Solution:
     Raises
     ------
     ValueError
-        If P is an operator and the QP is too large to assemble it, or if a matrix
-        contains NaN or inf.
+        If P is an operator without preconditioners and the QP is too large to assemble
+        it, or if a matrix contains NaN or inf.
     ArithmeticError
         If no point with a KKT residual of at most 1e-9 is found, usually because the
         constraints contradict each other or the objective is unbounded below.
@@ -93,7 +97,7 @@ def reference_solution(qp: QP, residual: Residual = _relative) -> Solution:
     if not qp.is_explicit and qp.q.size + qp.b.size + qp.h.size <= MAX_ASSEMBLED:
         qp = replace(qp, P=assembled(qp.P))
     if not qp.is_explicit:
-        raise ValueError("the reference solve needs P as a matrix; got an operator")
+        return reference_of_operator(qp)
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):
         raise ValueError("the reference solve needs finite matrices; got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf

@@ -21,7 +21,7 @@ from mortarbench.problems.duality.problem import qp_choice
 from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import LocalSubdomains, subdomains_of
-from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.decomposed_bodies import parts_of
 
@@ -34,7 +34,7 @@ def probe(n):
 def emitted(name, ranks):
     """Emit the QP on all ranks; gather descriptions of the local parts on rank 0."""
     case = parse(name, PROBLEMS)
-    made = case.family.emission("dual", case.params)(ranks, reference_over_ranks)
+    made = case.family.emission("dual", case.params)(ranks, reference_of_operator)
     share = made.share().qp
     rows = share.P.halo.rows
     own = rows[share.P.halo.owned]
@@ -70,7 +70,7 @@ def own_subdomains(name, ranks):
             case.family.contact_problem(case.params),
             qp_choice("dual", case.params),
         )
-        path = decomposed_path(problem, choice, ranks, reference_over_ranks)
+        path = decomposed_path(problem, choice, ranks, reference_of_operator)
         return path.problem(choice.step, choice.iterate).problem.dual.subdomains
     problem = parts_of(name)
     return LocalSubdomains(problem, ranks, subdomains_of(problem, ranks.size))

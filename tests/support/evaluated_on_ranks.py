@@ -15,7 +15,7 @@ from mortarbench.harness.verify.certificate import UncertifiableError
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.verdicts import evaluated_by_ranks, plain
 from mortarbench.problems import PROBLEMS
-from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -27,9 +27,9 @@ def evaluated(name, ranks):
     """Evaluate answers on all ranks; rank 0 also returns the answers."""
     case_id = parse(name, PROBLEMS)
     emit = case_id.family.emission(case_id.form, case_id.params)
-    emitted = emit(ranks, reference_over_ranks)
+    emitted = emit(ranks, reference_of_operator)
     digest = emitted.digest()
-    alone = emit(Ranks(MPI.COMM_SELF), reference_over_ranks).digest()
+    alone = emit(Ranks(MPI.COMM_SELF), reference_of_operator).digest()
     found, solved = [], {}
     for tol, wrong in WRONG:
         share = emitted.share()

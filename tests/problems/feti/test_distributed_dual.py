@@ -52,7 +52,7 @@ LATER = (
     "greco/n=7/mu=0.4/iterate=2/feti=2/dual",
     "greco/n=4/dim=3/depth=2/feti=2/dual",
 )
-#: case in which an active set method alone cycles (`solvers.reference.over_ranks`)
+#: case in which an active set method alone cycles (`solvers.reference.operators`)
 CIRCLES = (
     "beam-ring/Nr=1/Nh=3/radial=6/steps=2/relin=2/feti=7/contact=mortar/"
     "friction=coulomb/mu=0.3/loading=static/dual"

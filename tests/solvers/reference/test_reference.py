@@ -466,6 +466,7 @@ def test_the_reference_uses_no_other_solver():
         "mortarbench.solvers.common", "mortarbench.solvers.common.stopping",
         "mortarbench.solvers.reference", "mortarbench.solvers.reference.equilibrate",
         "mortarbench.solvers.reference.interior",
+        "mortarbench.solvers.reference.operators",
         "mortarbench.solvers.reference.polish",
         "mortarbench.solvers.reference.projection",
         "mortarbench.solvers.reference.saddle", "mortarbench.solvers.reference.solve",

@@ -1,9 +1,9 @@
-"""Reference solve of duals distributed over MPI ranks: active sets with CG on faces.
+"""Reference solve of QPs with an operator P: active sets with CG on faces.
 
 The problem is to minimise ½xᵀFx + qᵀx subject to Gx = e, l ≤ x ≤ u and ‖x_I‖ ≤ r on
-discs. The components of x are distributed over the ranks (`harness.distributed`). The
-equality rows must be linearly independent on the components without bounds, which is
-the case if all bodies are supported.
+discs, where F is an operator with a preconditioner, such as the dual of decomposed
+bodies. The equality rows must be linearly independent on the components without bounds,
+which is the case if all bodies are supported.
 
 1. On a face, some components are fixed at bounds, and the free components x_𝓕 solve a
    linear system. The system is solved by conjugate gradients with a preconditioner and
@@ -40,8 +40,7 @@ from scipy.sparse import csc_matrix, csr_array, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
 from mortarbench.harness import QP, Discs, Solution, Status, Vector
-from mortarbench.harness.distributed.vectors import DistributedColumns, distributed
-from mortarbench.harness.operators import is_semidefinite
+from mortarbench.harness.operators import is_semidefinite, preconditioned
 from mortarbench.harness.sets.blocks import norms
 from mortarbench.solvers.common.stopping import relative_residual
 
@@ -69,17 +68,17 @@ MAX_TURN = 1e-7
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 
 
-def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
-    """Solve a distributed dual to about working precision.
+def reference_of_operator(qp: QP, start: Solution | None = None) -> Solution:
+    """Solve a QP whose P provides preconditioners to about working precision.
 
-    The call is collective over all ranks.
-
-    qp : the dual, with the local components of this rank
-    start : solution of a dual that differs only in its bounds; its active set is tried
+    qp : a QP without inequality rows, over bounds and at most one set of discs
+    start : solution of a QP that differs only in its bounds; its active set is tried
         first
 
     Raises
     ------
+    ValueError
+        If P has no diagonal or no preconditioners, or if the QP has other constraints.
     ArithmeticError
         If no active set is confirmed after 300 faces, if the point of the confirmed
         active set has a KKT residual above 1e-9, or if the equality rows are linearly
@@ -87,23 +86,26 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
 
     """
     task = _Task.of(qp)
-    point = task.zero_point() if start is None else _Point.of(start)
+    point = (
+        task.zero_point() if start is None else _Point(start.x, start.y, start.z_box)
+    )
     face = task.first_face(point)
     fewest, patience = np.inf, PATIENCE
     for faces in range(1, MAX_FACES + 1):
         point = task.minimise_on_face(point.x, face)
         following = task.next_face(point, face)
-        wrong = face.state != following.state
-        changes = task.total(float(np.count_nonzero(wrong)))
-        if not changes and task.is_normal(point, face):
+        wrong = np.flatnonzero(face.state != following.state)
+        if not wrong.size and task.is_normal(point, face):
             return _check_residual(qp, task, point, faces)
-        patience = PATIENCE if changes < fewest else patience - 1
-        fewest = min(fewest, changes)
-        if patience < 0 and changes:
-            wrong = task.only_last(wrong)
-        face = following._replace(state=np.where(wrong, following.state, face.state))
+        patience = PATIENCE if wrong.size < fewest else patience - 1
+        fewest = min(fewest, wrong.size)
+        if patience < 0:
+            wrong = wrong[-1:]
+        state = face.state.copy()
+        state[wrong] = following.state[wrong]
+        face = following._replace(state=state)
     raise ArithmeticError(
-        "the reference solve over ranks did not find the optimal active set among "
+        "the reference solve of an operator did not find the optimal active set among "
         f"{MAX_FACES} trials"
     )
 
@@ -111,33 +113,28 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
 def _check_residual(qp: QP, task: _Task, point: _Point, faces: int) -> Solution:
     s = Solution(
         status=Status.SOLVED,
-        x=distributed(task.discs.project(point.x), task.G.ranks),
+        x=task.discs.project(point.x),
         y=point.y,
         z=np.zeros(0),
-        z_box=distributed(point.z, task.G.ranks),
+        z_box=point.z,
         iterations=faces,
         counts={"P_products": task.products},
     )
     worst = relative_residual(qp, s, MAX_REFERENCE_RESIDUAL)
     if not worst <= MAX_REFERENCE_RESIDUAL:
         raise ArithmeticError(
-            f"the reference solve over ranks left a KKT residual of {worst:.1e}, more "
-            f"than {MAX_REFERENCE_RESIDUAL:g}"
+            f"the reference solve of an operator left a KKT residual of {worst:.1e}, "
+            f"more than {MAX_REFERENCE_RESIDUAL:g}"
         )
     return s
 
 
 class _Point(NamedTuple):
-    """Local components of a point, with the multipliers of Gx = e."""
+    """A point with its multipliers."""
 
     x: Vector  #: (n,)
-    y: Vector  #: (r,) multipliers of Gx = e, replicated on every rank
+    y: Vector  #: (r,) multipliers of Gx = e
     z: Vector  #: (n,) multipliers, normal to the sets; negative at a lower bound
-
-    @classmethod
-    def of(cls, s: Solution) -> _Point:
-        """Return the local components of a solution."""
-        return cls(np.asarray(s.x), np.asarray(s.y), np.asarray(s.z_box))
 
 
 class _Face(NamedTuple):
@@ -152,37 +149,43 @@ class _Face(NamedTuple):
 
 @dataclass(eq=False)
 class _Task:
-    """Local components of a QP as plain arrays."""
+    """A QP with its preconditioner."""
 
     F: Callable[[Vector], Vector]
     M: Callable[[Vector], Vector]  #: product with an approximation of F⁻¹
-    G: DistributedColumns
+    G: csr_array
     e: Vector
     q: Vector
     lower: Vector
     upper: Vector
-    discs: Discs  #: discs of local components
+    discs: Discs
     length: Vector  #: (k,) γ of each disc, in units of x divided by units of z
     has_kernel: bool  #: True if F is semidefinite
     products: int = 0
 
     @classmethod
     def of(cls, qp: QP) -> _Task:
-        M = qp.P.preconditioner("dirichlet", "stiffness")
-        q, lower, upper = (np.asarray(v) for v in (qp.q, qp.lb, qp.ub))
-        discs = Discs(np.zeros((0, 2), dtype=np.int64), np.zeros(0))
-        for one in qp.sets[1:]:
-            assert isinstance(one, Discs)
-            discs = Discs(one.index, np.asarray(one.radius))
-        diagonal = np.asarray(qp.P.diagonal())
+        P, diagonal = preconditioned(qp.P), qp.diagonal()
+        none = Discs(np.zeros((0, 2), dtype=np.int64), np.zeros(0))
+        discs, *others = *qp.sets[1:], none
+        if P is None or diagonal is None:
+            raise ValueError(
+                "the reference solve needs P as a matrix; got an operator without a "
+                "diagonal or preconditioners"
+            )
+        if qp.h.size or len(others) > 1 or not isinstance(discs, Discs):
+            raise ValueError(
+                "the reference solve of an operator needs a QP with bounds, equality "
+                "rows and at most one set of discs"
+            )
         return cls(
             lambda x: np.asarray(qp.P @ x),
-            lambda x: np.asarray(M(x)),
-            qp.A,
-            np.asarray(qp.b),
-            q,
-            lower,
-            upper,
+            P.preconditioner("dirichlet", "stiffness"),
+            csr_array(qp.A),
+            qp.b,
+            qp.q,
+            qp.lb,
+            qp.ub,
             discs,
             1 / diagonal[discs.index].mean(axis=1),
             is_semidefinite(qp.P),
@@ -191,23 +194,6 @@ class _Task:
     def zero_point(self) -> _Point:
         zero = np.zeros(self.q.size)
         return _Point(zero, np.zeros(self.e.size), zero)
-
-    def total(self, part: float) -> float:
-        """Return the sum of a number over all ranks."""
-        return float(self.G.ranks.total(np.array([part]))[0])
-
-    def only_last(self, which: Mask) -> Mask:
-        """Return a mask with only the last True entry of all ranks, in rank order."""
-        ranks = self.G.ranks
-        local = np.flatnonzero(which)
-        last_rank = ranks.extreme(float(ranks.rank if local.size else -1), np.max)
-        only = np.zeros_like(which)
-        if ranks.rank == last_rank:
-            only[local[-1]] = True
-        return only
-
-    def norm(self, v: Vector) -> float:
-        return float(np.sqrt(self.total(float(v @ v))))
 
     def gradient(self, x: Vector) -> Vector:
         """Return Fx + q."""
@@ -238,14 +224,14 @@ class _Task:
         moving, origin = self.moving(face)
         curvature, on_disc = np.zeros(x.size), self.on_disc(face)
         curvature[self.discs.index] = (face.curvature * on_disc)[:, None]
-        columns = DistributedColumns(csr_array(self.G.part @ moving), self.G.ranks)
+        columns = csr_array(self.G @ moving)
         try:
-            coarse = cholesky(csc_matrix(columns.gram()))
+            coarse = cholesky(csc_matrix(columns @ columns.T))
         except CholmodNotPositiveDefiniteError:
             raise ArithmeticError(
-                "the reference solve over ranks reached a face with linearly dependent "
-                "equality rows; a body whose contacts are open on this face may lack "
-                "supports"
+                "the reference solve of an operator reached a face with linearly "
+                "dependent equality rows; a body whose contacts are open on this face "
+                "may lack supports"
             ) from None
 
         def spread(t: Vector) -> Vector:
@@ -273,7 +259,7 @@ class _Task:
 
         x = origin + moving @ x
         x += spread(self.e - self.G @ x)
-        size = self.norm(project(self.q))
+        size = np.linalg.norm(project(self.q))
 
         def residual(x: Vector) -> tuple[Vector, Vector]:
             """Return −(Fx + q), and the part of it that CG reduces to zero."""
@@ -283,13 +269,13 @@ class _Task:
 
         r, w = residual(x)
         for _ in range(MAX_CG_ROUNDS):
-            if self.norm(w) <= ROUNDING_RESIDUAL * size:
+            if np.linalg.norm(w) <= ROUNDING_RESIDUAL * size:
                 break
             better = x + self._correction(w, project, precondition, bent)
             better += spread(self.e - self.G @ better)
             r_better, w_better = residual(better)
             # CG on rounding errors can diverge along redundant rows, where F is zero
-            if not self.norm(w_better) < self.norm(w):
+            if not np.linalg.norm(w_better) < np.linalg.norm(w):
                 break
             x, r, w = better, r_better, w_better
         y = coarse(columns @ (r - bent(x)))
@@ -306,27 +292,27 @@ class _Task:
     ) -> Vector:
         """Return d in the face with a small 𝒫(w − Fd − bent(d)), computed by CG.
 
-        With redundant rows, F is semidefinite, and directions that consist
-        of rounding errors approach its kernel. Therefore the result is then d at the
-        smallest wᵀMw if wᵀMw grows by MAX_GROWTH, which exact arithmetic excludes.
+        With redundant rows, F is semidefinite, and directions that consist of rounding
+        errors approach its kernel. Therefore the result is then d at the smallest wᵀMw
+        if wᵀMw grows by MAX_GROWTH, which exact arithmetic excludes.
         """
-        d, enough = np.zeros(w.size), CG_REDUCTION * self.norm(w)
+        d, enough = np.zeros(w.size), CG_REDUCTION * np.linalg.norm(w)
         p = y = precondition(w)
-        wy = self.total(float(w @ y))
+        wy = float(w @ y)
         best, least = d.copy(), wy
         for _ in range(MAX_CG_STEPS):
             Fp = self.F(p) + bent(p)
             self.products += 1
-            curvature = self.total(float(p @ Fp))
+            curvature = float(p @ Fp)
             if not min(wy, curvature) > 0:  # only rounding errors of redundant rows
                 break
             alpha = wy / curvature
             d += alpha * p
             w = w - alpha * project(Fp)
-            if self.norm(w) <= enough:
+            if np.linalg.norm(w) <= enough:
                 break
             y = precondition(w)
-            wy, before = self.total(float(w @ y)), wy
+            wy, before = float(w @ y), wy
             if wy < least:
                 best, least = d.copy(), wy
             elif self.has_kernel and wy > MAX_GROWTH * least:
@@ -356,10 +342,7 @@ class _Task:
         """Return the face predicted by the signs of multipliers and violated bounds."""
         x, _, z = point
         n, radius = x.size, self.discs.radius
-        largest = [
-            self.G.ranks.extreme(float(abs(v).max(initial=0.0)), np.max) for v in (x, z)
-        ]
-        off_x, off_z = (SIGN_ROUNDING * v for v in largest)
+        off_x, off_z = (SIGN_ROUNDING * abs(v).max(initial=0.0) for v in (x, z))
         same, state = self.lower == self.upper, face.state[:n]
         below = np.where(state < 0, (z <= off_z) | same, x < self.lower - off_x)
         above = np.where(state > 0, z >= -off_z, x > self.upper + off_x) & ~below
@@ -379,7 +362,7 @@ class _Task:
         """Return True if x_I is normal to each linearised disc, up to `MAX_TURN`."""
         on, across = self.on_disc(face), np.asarray(self.moving(face)[0] @ point.x)
         turn = norms(across[self.discs.index])[on] / self.discs.radius[on]
-        return self.G.ranks.extreme(float(turn.max(initial=0.0)), np.max) <= MAX_TURN
+        return bool(turn.max(initial=0.0) <= MAX_TURN)
 
     def _pushes(self, point: _Point) -> tuple[NDArray[np.float64], Vector]:
         """Return w/‖w‖ (k, d) and ‖w‖ (k,) for w = x_I + γz_I of each disc."""
