@@ -157,20 +157,13 @@ def measure_and_judge(
     else:
         record = judged(record, whole() if by_ranks else qp, solution)
     record = _check_memory(memory_limit, noted(record, reply.message, *notes)).replace(
-        sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
+        sizes=sizes
     )
     is_incomplete = evaluation is None or None in (
         evaluation["quantities"],
         evaluation["bounds"],
     )
     return JudgedMeasurement(record, solution, is_incomplete and not is_pointless)
-
-
-def _as_tuples(data: Any) -> Any:
-    """Convert lists to tuples, since JSON stores tuples as lists."""
-    if isinstance(data, dict):
-        return {key: _as_tuples(value) for key, value in data.items()}
-    return tuple(data) if isinstance(data, list) else data
 
 
 def _with_cost(reply: Reply, record: Record) -> tuple[Record, *tuple[str, ...]]:
