@@ -45,7 +45,7 @@ CELLS = (12, 24, 36, 48)  #: cells per side, for 88, 376, 820 and 1468 discs
 PERTURBED = np.linspace(0.97, 1.03, 10)  #: factors of the norm ‖P‖, or of the load
 LARGE = (256, 512)  #: cells per side of problems in which P is an operator
 ROUNDS = 5  #: number of alternating rounds in the measurement of times
-CONIC = ("clarabel", "scs", "qoco", "cvxopt", "ecos")
+CONIC = ("clarabel", "scs", "qoco")
 METHODS = ("smalbe", "smalbe-paper", "projected-gradient", "nsgs")
 
 

@@ -163,8 +163,6 @@ class Record(Measurement):
     build_peak_mib: float | None = None
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`
-    #: time of a fixed computation before the measurement, to reveal drift
-    canary_seconds: float | None = None
     threads: int | None = None  #: largest thread count of any library in the worker
     cpu: int | None = None  #: number of the CPU to which the worker was bound
     ranks: int = 1  #: number of MPI processes of the solve
@@ -331,7 +329,6 @@ _NOT_NEGATIVE = (
     "build_peak_mib",
     "recover_seconds",
     "certify_seconds",
-    "canary_seconds",
     "threads",
     "cpu",
     "primal",

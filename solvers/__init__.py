@@ -48,9 +48,6 @@ SOLVERS: Registry[Solver] = Registry(
         "qpalm": entry("mortarbench.solvers.adapters.qpalm_", "QPALM"),
         "qoco": entry("mortarbench.solvers.adapters.qoco_", "QOCO"),
         "qtqp": entry("mortarbench.solvers.adapters.qtqp_", "QTQP"),
-        "quadprog": entry("mortarbench.solvers.adapters.quadprog_", "Quadprog"),
-        "cvxopt": entry("mortarbench.solvers.adapters.cvxopt_", "CVXOPT"),
-        "ecos": entry("mortarbench.solvers.adapters.ecos_", "ECOS"),
         "qpsolvers:*": entry("mortarbench.solvers.adapters.qpsolvers_", "QPSolvers"),
         "cvxpy:*": entry("mortarbench.solvers.adapters.cvxpy_", "CVXPY"),
     }

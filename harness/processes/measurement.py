@@ -144,17 +144,8 @@ def measure_and_judge(
         notes += reply.answer["notes"]
     else:
         record = judged(record, qp, solution)
-    record = _check_memory(memory_limit, noted(record, reply.message, *notes)).replace(
-        **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
-    )
+    record = _check_memory(memory_limit, noted(record, reply.message, *notes))
     return JudgedMeasurement(record, solution, needs_evaluation=not by_ranks)
-
-
-def _as_tuples(data: Any) -> Any:
-    """Convert lists to tuples, since JSON stores tuples as lists."""
-    if isinstance(data, dict):
-        return {key: _as_tuples(value) for key, value in data.items()}
-    return tuple(data) if isinstance(data, list) else data
 
 
 def _with_cost(reply: Reply, record: Record) -> tuple[Record, *tuple[str, ...]]:

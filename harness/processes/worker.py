@@ -38,8 +38,6 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from statistics import median
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -58,7 +56,7 @@ from mortarbench.harness.processes.protocol import (
     source_of,
 )
 from mortarbench.harness.processes.ranks import Build, RanksAsOne, this_rank
-from mortarbench.harness.qp import QP, Vector, no_rows
+from mortarbench.harness.qp import QP, no_rows
 from mortarbench.harness.record import finite, journal_name
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import (
@@ -136,7 +134,6 @@ class _SolverHost:
         for rows in (no_row, one_row_each):
             with suppress(DeclinedError, SolverError):
                 solve_once(self._solver, QP(P=P, **pull, **rows), 1e-6)
-        canary_seconds()
         gc.freeze()  # exclude the loaded modules from collections during measurements
         return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
 
@@ -168,7 +165,6 @@ class _SolverHost:
         else:
             qp = self._load(request)
         set_limit = _limit_memory if ranks is None else ranks.limit
-        canary = canary_seconds()
         set_limit(limit)
         timed = measure(
             solver,
@@ -199,8 +195,6 @@ class _SolverHost:
             "reported": finite(dict(s.reported)),
             "worked_seconds": timed.worked_seconds,
             "solves": timed.solves,
-            # fields that the parent copies to the record unchanged
-            "record": {"canary_seconds": canary},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
@@ -265,28 +259,6 @@ def _begin_sequence(
         "tolerances"
     )
     return lambda qp, tol: partial(Solution.without_point, qp, Status.DECLINED, why)
-
-
-def canary_seconds() -> float:
-    """Return the median of five times of a small fixed kernel, in s.
-
-    The time shows whether the speed of the machine drifts during a run.
-    """
-    matrix, vector = _aligned(128 * 128).reshape(128, 128), _aligned(128)
-    times = []
-    for _ in range(5):
-        start = perf_counter()
-        for _ in range(10):
-            matrix @ vector
-        times.append(perf_counter() - start)
-    return median(times)
-
-
-def _aligned(count: int) -> Vector:
-    """Return a vector of ones that starts at a cache line, for reproducible times."""
-    buffer = np.ones(count + 8)
-    start = -buffer.ctypes.data % 64 // 8
-    return buffer[start : start + count]
 
 
 def _one_thread() -> int:

@@ -247,22 +247,6 @@ def block_of(p: Pair) -> tuple[str, float, str]:
     return p.after.case, p.after.tol, p.after.first.environment
 
 
-def canary_ratio(pairs: Sequence[Pair]) -> Mean | None:
-    """Average the ratios of the canary, which show changes of the machine."""
-
-    def log(p: Pair) -> float | None:
-        sides = [
-            [r.canary_seconds for r in o.records if r.canary_seconds]
-            for o in (p.after, p.before)
-        ]
-        if not (p.same_machine and all(sides)):
-            return None
-        after, before = (float(np.mean(np.log(times))) for times in sides)
-        return after - before
-
-    return _over_cells((p, log(p)) for p in pairs)
-
-
 def _over_cells(changes: Iterable[tuple[Pair, float | None]]) -> Mean | None:
     known = [(log, str(_key(p.after))) for p, log in changes if log is not None]
     return mean_of([log for log, _ in known], [name for _, name in known])

@@ -9,7 +9,6 @@ from mortarbench.reports.compare.changes import (
     Comparison,
     Mean,
     Pair,
-    canary_ratio,
     mean_ratio,
     relative_ratio,
     side,
@@ -86,10 +85,9 @@ def _summary(c: Comparison) -> Iterator[Part]:
         relative = relative_ratio(c, solver)
         means = _mean_cells(mean_ratio(c.of(solver)))
         rows.append((Cell.name(solver), *means, Cell.number(relative, ratio_text)))
-    for name, mean in (("all", mean_ratio(c.pairs)), ("canary", canary_ratio(c.pairs))):
-        if mean is not None:
-            total = Cell(text=name, kind="total")
-            rows.append((total, *_mean_cells(mean, "total"), Cell(kind="total")))
+    if (mean := mean_ratio(c.pairs)) is not None:
+        total = Cell(text="all", kind="total")
+        rows.append((total, *_mean_cells(mean, "total"), Cell(kind="total")))
     yield Table(
         caption=TEXT("means"),
         columns=("solver", "cells", "ratio", "change", "relative to the others"),

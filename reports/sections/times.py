@@ -8,13 +8,9 @@ versions contain neither.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from statistics import median
 from typing import NamedTuple
 
-import numpy as np
-
-from mortarbench.harness import Record
 from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
 from mortarbench.harness.suite.suite import NULL_SUFFIX
 from mortarbench.reports.data.cells import (
@@ -35,10 +31,9 @@ from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.sweeps import accuracy_figure
 from mortarbench.reports.sections import Analysis, section
-from mortarbench.reports.statistics.intervals import COVERAGE, median_interval
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 TEXT = Sentences(__name__, LEAST=COVERAGE)
-_PARTS = 3  #: number of parts; the canary's drift is measured from first to last
 
 
 @section(20, "times", "Times")
@@ -175,12 +170,10 @@ class _Twins(NamedTuple):
     24,
     "precision",
     "Precision of the times",
-    "Precision of the times: the records contain no times of the canary (a fixed "
-    "computation before each measurement), and the suite does not measure a solver "
-    "twice (null_arm).",
+    "Precision of the times: the suite does not measure a solver twice (null_arm).",
 )
 def precision(a: Analysis) -> Iterator[Part]:
-    """Tabulate null arms and canaries; yield nothing if the records have neither."""
+    """Tabulate null arms; yield nothing if the records have none."""
     if null := _null_ratios(a.evidence):
         width = median(each.ratio.half_width for each in null)
         covering = sum(each.equal for each in null)
@@ -206,19 +199,6 @@ def precision(a: Analysis) -> Iterator[Part]:
                 ),
             ),
         )
-    timed = [r for r in a.evidence.records if r.canary_seconds and r.started]
-    if timed:
-        timed.sort(key=lambda r: r.started)
-        solvers = list(dict.fromkeys(r.solver for r in a.evidence.records))
-        groups = [(s, [r for r in timed if r.solver == s]) for s in solvers]
-        rows = [_canary_row(name, mine) for name, mine in groups if mine]
-        total = (replace(cell, kind="total") for cell in _canary_row("all", timed))
-        yield from TEXT.parts("canary")
-        yield Table(
-            caption=TEXT("canary_caption"),
-            columns=("solver", "measurements", "canary", "central 90 %", "drift"),
-            rows=(*rows, tuple(total)),
-        )
 
 
 def _null_ratios(evidence: Evidence) -> list[_Twins]:
@@ -231,18 +211,3 @@ def _null_ratios(evidence: Evidence) -> list[_Twins]:
                 ratio = paired_ratio(null.by_block, twin.by_block)
                 twins += [_Twins(twin, null, ratio)] if ratio is not None else []
     return twins
-
-
-def _canary_row(name: str, mine: Sequence[Record]) -> tuple[Cell, ...]:
-    times = [r.canary_seconds for r in mine if r.canary_seconds]
-    low, high = np.quantile(times, (0.05, 0.95)) / median(times) - 1
-    span = Cell(text=f"{low:+.1%} to {high:+.1%}", value=high - low)
-    third = len(times) // _PARTS
-    drift = median(times[-third:]) / median(times[:third]) - 1 if third else None
-    return (
-        Cell.name(name),
-        Cell.number(len(times)),
-        Cell.time(median_interval(times)),
-        span if len(times) > 1 else Cell(),
-        Cell.number(drift, "{:+.1%}".format),
-    )

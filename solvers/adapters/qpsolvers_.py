@@ -9,11 +9,12 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.sparse import eye_array, vstack
 
 from mortarbench.harness import (
     NO_SOLUTION,
@@ -30,9 +31,7 @@ from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     dense,
-    fixed_in_rows,
     needs_dense,
-    needs_independent_rows,
     objective_factor,
     on_present_bounds,
 )
@@ -126,9 +125,10 @@ class QPSolvers:
             "convex QPs are unbounded (conformance, shape 'unconstrained').",
             "qpsolvers reports no iterations for clarabel, cvxopt, daqp, highs, "
             "quadprog and sip.",
-            "The backend ecos attains only half of the requested digits; use our "
-            "solver `ecos` instead. pyqpmad, which `make setup` does not install, "
-            "returns wrong multipliers for fixed variables.",
+            "quadprog has no tolerance and solves strictly convex QPs only.",
+            "The backend ecos attains only half of the requested digits. pyqpmad, "
+            "which `make setup` does not install, returns wrong multipliers for fixed "
+            "variables.",
         ),
     )
 
@@ -146,9 +146,9 @@ class QPSolvers:
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
         if self.backend in NEEDS_FIXED_IN_ROWS:
-            qp, _ = fixed_in_rows(qp)
+            qp, _ = _fixed_in_rows(qp)
         needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS
-        if needs_rank and (reason := needs_independent_rows(qp)):
+        if needs_rank and (reason := _needs_independent_rows(qp)):
             return reason
         dense_only = self.backend in DENSE_BACKENDS
         return needs_dense(qp, 4) if dense_only else needs_matrices(qp)
@@ -156,7 +156,7 @@ class QPSolvers:
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         if self.backend not in NEEDS_FIXED_IN_ROWS:
             return self._prepare(qp, tol)
-        other, back = fixed_in_rows(qp)
+        other, back = _fixed_in_rows(qp)
         solve = self._prepare(other, tol)
         return lambda: back(solve())
 
@@ -249,3 +249,33 @@ def _vector(v: Any, size: int, *, absent: bool = False) -> Vector:
     if v is None or np.size(v) != size:
         return np.full(size, np.nan)
     return np.asarray(v, dtype=np.float64).ravel()
+
+
+def _needs_independent_rows(qp: QP) -> str | None:
+    """Return a reason to decline `qp` if its equality rows are dependent, or None."""
+    # The eigenvalues of AAᵀ are the squared singular values of A. Therefore rows count
+    # as dependent if the ratio of the smallest to the largest singular value of A is
+    # below about √(mε) for m rows and the machine precision ε.
+    gram = dense(csc(qp.A) @ csc(qp.A).T)
+    if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
+        return None
+    return "the equality rows are linearly dependent"
+
+
+def _fixed_in_rows(qp: QP) -> tuple[QP, Callable[[Solution], Solution]]:
+    """Replace equal bounds by equality rows.
+
+    Returns the new QP, and a function that converts its solutions to solutions of `qp`.
+    """
+    fixed, m = np.flatnonzero(qp.lb == qp.ub), qp.b.size
+    lb, ub = qp.lb.copy(), qp.ub.copy()
+    lb[fixed], ub[fixed] = -np.inf, np.inf
+    rows = eye_array(qp.q.size, format="csr")[fixed]
+    A, b = vstack([csc(qp.A), rows], format="csr"), np.append(qp.b, qp.lb[fixed])
+
+    def back(s: Solution) -> Solution:
+        z_box = s.z_box.copy()
+        z_box[fixed] = s.y[m:]
+        return replace(s, y=s.y[:m], z_box=z_box)
+
+    return replace(qp, A=A, b=b).with_bounds(lb, ub), back

@@ -9,8 +9,8 @@ to multipliers of the QP.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,36 +44,6 @@ def needs_dense(qp: QP, copies: float) -> str | None:
         stores at the same time
     """
     return needs_matrices(qp) or too_large(qp.q.size, copies)
-
-
-def needs_independent_rows(qp: QP) -> str | None:
-    """Return a reason to decline `qp` if its equality rows are dependent, or None."""
-    # The eigenvalues of AAᵀ are the squared singular values of A. Therefore rows count
-    # as dependent if the ratio of the smallest to the largest singular value of A is
-    # below about √(mε) for m rows and the machine precision ε.
-    gram = dense(csc(qp.A) @ csc(qp.A).T)
-    if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
-        return None
-    return "the equality rows are linearly dependent"
-
-
-def fixed_in_rows(qp: QP) -> tuple[QP, Callable[[Solution], Solution]]:
-    """Replace equal bounds by equality rows.
-
-    Returns the new QP, and a function that converts its solutions to solutions of `qp`.
-    """
-    fixed, m = np.flatnonzero(qp.lb == qp.ub), qp.b.size
-    lb, ub = qp.lb.copy(), qp.ub.copy()
-    lb[fixed], ub[fixed] = -np.inf, np.inf
-    rows = eye_array(qp.q.size, format="csr")[fixed]
-    A, b = vstack([csc(qp.A), rows], format="csr"), np.append(qp.b, qp.lb[fixed])
-
-    def back(s: Solution) -> Solution:
-        z_box = s.z_box.copy()
-        z_box[fixed] = s.y[m:]
-        return replace(s, y=s.y[:m], z_box=z_box)
-
-    return replace(qp, A=A, b=b).with_bounds(lb, ub), back
 
 
 def csc(M: Matrix) -> csc_matrix:

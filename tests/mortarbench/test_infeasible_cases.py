@@ -37,7 +37,7 @@ def write(folder, *names):
     paths = ", ".join(f'"{folder / name}.npz"' for name in names)
     text = (
         'name = "claims"\ntolerances = [1e-6]\nrepeats = 1\n'
-        'solvers = ["osqp", "quadprog"]\n[[problems]]\nfamily = "file"\n'
+        'solvers = ["osqp", "daqp"]\n[[problems]]\nfamily = "file"\n'
         f"params = {{ path = [{paths}] }}\n"
     )
     path = folder / "claims.toml"

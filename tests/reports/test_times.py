@@ -100,21 +100,6 @@ def test_null_arms_of_sequences_are_paired_with_sequences(record, section):
     )
 
 
-def test_the_drift_of_the_canary_is_that_of_the_machine(record, section):
-    records = [record(repeat=i, canary_seconds=1e-5 * (1 + 0.1 * i)) for i in range(6)]
-    found = rows(section(records, "precision").tables[0])
-    assert [row["solver"].text for row in found] == ["a", "all"]
-    assert found[0]["drift"].value == pytest.approx(1.45 / 1.05 - 1)
-    assert found[0]["canary"].value == pytest.approx(1.25e-5)
-
-
-def test_a_single_canary_time_has_no_spread(record, section):
-    first, *_ = rows(section([record(canary_seconds=1e-5)], "precision").tables[0])
-
-    assert (first["central 90 %"].text, first["central 90 %"].value) == ("–", None)
-    assert first["drift"].text == "–"
-
-
 def test_time_to_accuracy_is_the_time_of_the_fastest_verified_answer(record, section):
     sweep = [
         record(tol=1e-2, accuracy=1e-6, total_seconds=0.001, verdict=Verdict.WRONG),

@@ -15,7 +15,7 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.common.conversion import to_cone
 
 WILDCARDS = ("cvxpy:CLARABEL", "cvxpy:SCS", "cvxpy:QOCO")
-NATIVE = ("clarabel", "scs", "qoco", "cvxopt", "ecos")
+NATIVE = ("clarabel", "scs", "qoco")
 
 
 def solver_of(name):
@@ -80,15 +80,14 @@ def conic_qp(seed):
 
 
 #: largest error in x at tol 1e-8
-ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6, "ecos": 1e-6}
+ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6}
 #: largest error in x of all other solvers: interior-point methods stop at a gap of
 #: tol, which permits an angle of √tol between x and z of a disc
 OTHER_ERROR = 5e-4
 #: solvers whose own test is relative to the largest row; the rows of these QPs differ
 #: by a factor of ten
 NORMWISE = ("scs", "cvxpy:SCS")
-#: for 7 of 500 QPs, residuals exceed 1e-7, and ecos reports a failure
-RESIDUAL = {"ecos": 3e-7, **dict.fromkeys(NORMWISE, 1e-6)}
+RESIDUAL = dict.fromkeys(NORMWISE, 1e-6)
 
 
 def check_solution(name, seed, tol=1e-8):
@@ -98,8 +97,7 @@ def check_solution(name, seed, tol=1e-8):
     value = qp.objective(best.x)
     worst = kkt_residuals(qp, s).worst
     assert worst <= RESIDUAL.get(name, 10 * tol)
-    solved = worst <= 10 * tol or name in NORMWISE
-    assert s.status is (Status.SOLVED if solved else Status.FAILED)
+    assert s.status is Status.SOLVED
     assert qp.objective(s.x) == pytest.approx(value, rel=1e-8)
     assert np.abs(s.x - best.x).max() <= ERROR.get(name, OTHER_ERROR)
 
@@ -203,8 +201,6 @@ DEGENERATE = {
     "cvxpy:CLARABEL": (5e-3, 5e-4),
     "qoco": (1e-3, 4e-4),
     "cvxpy:QOCO": (1e-3, 4e-4),
-    "cvxopt": (1e-3, 4e-4),
-    "ecos": (2e-4, 4e-6),
     "scs": (1e-6, 1e-8),
     "cvxpy:SCS": (1e-6, 1e-8),
 }

@@ -16,7 +16,6 @@ from mortarbench.harness.verify.measure import measure
 from mortarbench.solvers import SOLVERS
 
 TOL, TIGHT = 1e-9, 1e-12
-LEAST_TOL = {"ecos": 1e-8}  #: tolerance below which a solver reports failure
 ACCEPTS = {
     name: getattr(solver, "accepts", (Box,))
     for name, solver in SOLVERS.items()
@@ -34,7 +33,7 @@ FEW = ("discs", "cones", "discs and cones")
 #: Interior-point methods end off the central path: z and x differ in direction by the
 #: square root of the gap. These limits on the error in x at the smallest tolerance are
 #: about twice the largest error on 1250 QPs.
-ENDS_OFF_PATH = {"clarabel": 1e-4, "qoco": 3e-4, "cvxopt": 5e-6, "ecos": 1e-4}
+ENDS_OFF_PATH = {"clarabel": 1e-4, "qoco": 3e-4}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -68,12 +67,11 @@ def faults(name, shape, seeds):
             off = abs(qp.objective(s.x) - best) / size, np.abs(s.x - at).max()
             return s, np.array(off)
 
-        tol = LEAST_TOL.get(name, TOL)
-        s, errors = solved(tol)
+        s, errors = solved(TOL)
         if s.status is Status.DECLINED:
             declined.append((seed, s.message))
             continue
-        verdict = judged(s.status, kkt_residuals(qp, s), tol)
+        verdict = judged(s.status, kkt_residuals(qp, s), TOL)
         if not (errors <= [1e-8, 1e-6]).all():
             errors = np.fmin(errors, solved(TIGHT)[1])
         if verdict is not Verdict.VERIFIED or not (errors <= limits).all():

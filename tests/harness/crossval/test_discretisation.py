@@ -35,7 +35,7 @@ from mortarbench.problems.models.obstacle import (
     exact_height,
     obstacle_problem,
 )
-from mortarbench.reports.document.mesh_errors import mesh_table
+from mortarbench.reports.validation.report import mesh_table
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT
 from tests.support.gmsh_files import stacked_blocks
