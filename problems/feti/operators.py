@@ -259,7 +259,7 @@ class DualOperator:
             packed, E, comm = self.packed, self.equalities, self.domains.comm
             BW = scaled_columns(packed.B, weights)
             grams = comm.gather(csr_array(BW @ packed.BT))
-            inverses = None
+            inverses: Any = None
             if grams:  # on rank 0
                 gram = csr_array(sum(grams[1:], start=grams[0]))
                 inverses = gram_inverses(gram, E)
@@ -346,17 +346,15 @@ def condensed_groups(
         ranks = [r for r, one in enumerate(offered) if k in one]
         computes[k] = min(ranks, key=loads.__getitem__)
         loads[computes[k]] += size[k]
-    shared = [k for k in size if sum(k in one for one in offered) > 1]
-    blocks = {}
+    shared = {k for k in size if sum(k in one for one in offered) > 1}
+    blocks = dict[int, Condensed]()
     for k, group in explicit.items():
         if computes[k] == comm.rank:
-            condensed = group.template.condense(group.touched)
-            if k in shared:
-                blocks[k] = condensed
-            else:
-                yield group, condensed
-    for k in shared:
-        condensed = comm.bcast(blocks.pop(k, None), computes[k])
+            blocks[k] = group.template.condense(group.touched)
+            if k not in shared:
+                yield group, blocks.pop(k)
+    for k in sorted(shared):
+        condensed: Any = comm.bcast(blocks.pop(k, None), computes[k])
         if k in explicit:
             yield explicit[k], condensed
 

@@ -108,7 +108,7 @@ def spectrum(
         v -= alpha[-1] * V[k] + (beta[-1] * V[k - 1] if k else 0.0)
         v = P(v - (WV[: k + 1] @ v) @ V[: k + 1])
         Wv = metric(v)
-        length = float(np.sqrt(max(v @ Wv, 0.0)))
+        length = float(np.sqrt(max(float(v @ Wv), 0.0)))
         over = length <= BREAKDOWN * max(alpha)
         if over or k % CHECK_INTERVAL == CHECK_INTERVAL - 1 or k == n - 1:
             result = ritz_bounds(np.array(alpha), np.array(beta), length)
