@@ -37,7 +37,7 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.friction import friction_of
 from mortarbench.problems.contact.results import BulkResults, results_of
-from mortarbench.problems.contact.rows import ContactRows, without_fixed
+from mortarbench.problems.contact.rows import MIN_FREE, ContactRows, without_fixed
 from mortarbench.problems.contact.stepping import (
     Forces,
     LoadPath,
@@ -237,9 +237,10 @@ def decompose(
     E = np.array([m.E for m in bodies.materials]) * unit
     share = longitudinal_share(D)
     load = stage.forces._replace(value=stage.forces.value * stage.part)
-    lift = None
+    lift, moved = None, np.zeros(contact.rows.shape[1])
     if bodies.lift is not None:
-        lift = force_lookup(forces_of(bodies.lift * stage.part))
+        moved = bodies.lift * stage.part
+        lift = force_lookup(forces_of(moved))
     return DecomposedProblem(
         layout=layout,
         components=bodies.shape.dim,
@@ -253,8 +254,28 @@ def decompose(
         load=force_lookup(load),
         lift=lift,
         glue=glue,
-        contact=contact,
+        contact=_without_supports(contact, stage.fixed, moved),
     )
+
+
+def _without_supports(contact: Contact, fixed: Nodes, u: Vector) -> Contact:
+    """Return the rows without their entries at components that supports prescribe.
+
+    Rows of supports prescribe these components, so that the problem stays the same.
+    With the entries, the row of a supported node that slides on a stiff body would be
+    nearly a multiple of a row of its supports, and F nearly singular. A row that has
+    entries at such components only is unchanged.
+
+    u : (n,) displacement with the prescribed values at the components `fixed`
+    """
+    free = np.ones(contact.rows.shape[1])
+    free[fixed] = 0.0
+    size = abs(contact.rows)
+    changes = (size @ free > MIN_FREE * size.sum(axis=1)).astype(float)
+    off = csr_array(diags_array(changes) @ contact.rows @ diags_array(1 - free))
+    rows = csr_array(contact.rows - off)
+    rows.eliminate_zeros()
+    return contact._replace(rows=rows, c=contact.c - off @ u)
 
 
 def force_lookup(forces: Forces) -> Callable[[Nodes], Vector]:

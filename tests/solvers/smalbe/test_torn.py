@@ -89,6 +89,26 @@ def test_a_semidefinite_dual_ends_at_its_rounding_errors(keys, tol):
     assert s.counts["P_products"] < 150
 
 
+@pytest.mark.parametrize("ratio", [1, 1000, 10_000])
+@pytest.mark.parametrize("glue", ["orthonormal", "redundant"])
+def test_supports_along_the_contact_of_a_stiff_body_do_not_slow_the_solve(glue, ratio):
+    """Two slave nodes have tangential supports and friction.
+
+    If their friction rows also acted on the supports, the least eigenvalue of F would
+    be proportional to 1/ratio.
+    """
+    name = f"contact-patch/lower=4/upper=3/ratio={ratio}/friction=tresca/bound=5e7"
+    whole, pieces = (
+        build(f"{name}{keys}/dual") for keys in ("", f"/feti=3/glue={glue}")
+    )
+    s = SMALBE().prepare(pieces.qp, 1e-10)()
+    u, v = pieces.recover(s), whole.recover(SMALBE().prepare(whole.qp, 1e-10)())
+
+    assert s.status is Status.SOLVED
+    assert s.counts["P_products"] <= 25
+    assert abs(u - v).max() <= 1e-8 * abs(v).max()
+
+
 @pytest.mark.parametrize("tol", [1e-6, 1e-9])
 @pytest.mark.parametrize(
     "name",
