@@ -259,12 +259,12 @@ def decompose(
 
 
 def _without_supports(contact: Contact, fixed: Nodes, u: Vector) -> Contact:
-    """Return the rows without their entries at components that supports prescribe.
+    """Return friction rows without entries at components that supports prescribe.
 
     Rows of supports prescribe these components, so that the problem stays the same.
     With the entries, the row of a supported node that slides on a stiff body would be
-    nearly a multiple of a row of its supports, and F nearly singular. A row that has
-    entries at such components only is unchanged.
+    nearly a multiple of a row of its supports, and F nearly singular. Contact rows are
+    unchanged, and so are rows that have entries at such components only.
 
     u : (n,) displacement with the prescribed values at the components `fixed`
     """
@@ -272,6 +272,7 @@ def _without_supports(contact: Contact, fixed: Nodes, u: Vector) -> Contact:
     free[fixed] = 0.0
     size = abs(contact.rows)
     changes = (size @ free > MIN_FREE * size.sum(axis=1)).astype(float)
+    changes[: changes.size - contact.bound.size] = 0.0
     off = csr_array(diags_array(changes) @ contact.rows @ diags_array(1 - free))
     rows = csr_array(contact.rows - off)
     rows.eliminate_zeros()
