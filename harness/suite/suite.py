@@ -175,7 +175,7 @@ def parse_suite(
         }
         specs = _solvers(table["solvers"], solvers)
         cases, sequences = problems.cold, problems.sequences
-        specs = _on_ranks(specs, table, solvers, sequences)
+        specs = _on_ranks(specs, table, solvers)
         every = frozenset(case.name for group in (cases, *sequences) for case in group)
         return Suite(
             name=table["name"],
@@ -356,32 +356,38 @@ def _on_ranks(
     specs: tuple[SolverSpec, ...],
     table: Mapping[str, Any],
     registry: Mapping[str, Solver],
-    sequences: object,
 ) -> tuple[SolverSpec, ...]:
     """Return specs of each solver for every number of ranks in the suite.
 
-    A solver that does not support ranks is returned for a single rank. Sequences on
-    several ranks are refused, since the results that a solver reuses are stored in a
-    single process.
+    A solver that needs the entries of P is returned for a single rank: ranks apply P
+    together, but do not assemble it.
     """
     ranks = checked.filled_list("ranks", table["ranks"])
     counts = [ranks_asked(n, "ranks") for n in ranks]
     if len(set(counts)) < len(counts):
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
-    if counts != [1] and sequences:
+    if counts == [1]:
+        return specs
+    able = {s.label: _accepts_operators(resolve(s, registry)) for s in specs}
+    if not any(able.values()):
         raise InputError(
-            f"ranks = {shown(counts)}: a sequence runs in one process; expected "
-            "problems without a sequence, or no ranks"
-        )
-    able = {s.label: getattr(resolve(s, registry), "on_ranks", False) for s in specs}
-    if counts != [1] and not any(able.values()):
-        raise InputError(
-            f"ranks = {shown(counts)}: no solver runs on several ranks; expected "
-            "one that does, or no ranks"
+            f"ranks = {shown(counts)}: every solver needs the entries of P; expected "
+            "one that needs products only, or no ranks"
         )
     return tuple(
         spec.on(n) for spec in specs for n in (counts if able[spec.label] else [1])
     )
+
+
+def _accepts_operators(solver: Solver) -> bool:
+    """Return True if a solver accepts a QP whose P is an operator."""
+    import numpy as np
+    from scipy.sparse.linalg import aslinearoperator
+
+    from mortarbench.harness.qp import QP
+
+    tiny = QP.from_arrays(np.eye(2), np.zeros(2), lb=np.zeros(2))
+    return solver.declines(replace(tiny, P=aslinearoperator(np.eye(2)))) is None
 
 
 def _spec(entry: object) -> SolverSpec:
