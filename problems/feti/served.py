@@ -38,8 +38,8 @@ class Served:
     stresses: Callable[[Vector], Vector] | None = None
 
     def __post_init__(self) -> None:
-        """Let the ranks agree on their subdomains."""
-        _ = self.torn.domains
+        """Let the ranks agree on their subdomains, and compute the rows of B."""
+        _ = self.torn.rows
 
     @property
     def domains(self) -> Subdomains:

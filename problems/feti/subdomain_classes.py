@@ -248,11 +248,16 @@ class Subdomains:
     def combined(self, v: NDArray[Any]) -> NDArray[Any]:
         """Complete a torn vector (N,) with the subdomains of the other ranks."""
         if self.comm.size > 1:
-            rank_of = np.repeat(self.rank, np.diff(self.start))
-            parts = self.comm.gather(v[rank_of == self.comm.rank])
+            rank_of, own = self._rank_of, self.comm.rank
+            parts = self.comm.gather(v[rank_of == own] if own else v[:0])
             for rank, part in enumerate(parts[1:], 1):
                 v[rank_of == rank] = part
         return v
+
+    @cached_property
+    def _rank_of(self) -> NDArray[np.int16]:
+        """Rank of each torn unknown, (N,)."""
+        return np.repeat(self.rank.astype(np.int16), np.diff(self.start))
 
     def inverse(self, b: Vector) -> Vector:
         """Apply K⁺ to a torn vector (N,)."""

@@ -186,7 +186,7 @@ class TornBodies:
         multiplicity = np.repeat(self.nodes.multiplicity, self.problem.components)
         return np.asarray(multiplicity[self.free])
 
-    @property
+    @cached_property
     def spread(self) -> csr_array:
         """T (N, n), which maps displacements to torn unknowns in subdomain axes.
 
