@@ -60,7 +60,7 @@ x*‖²_P ≤ rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -111,6 +111,9 @@ POWER_ITERATION_FACTOR = 2.0
 #: A certificate is sharp if its `work` is at most this fraction of its squared
 #: `distance` d: without work, the bound √(d² + 2·work) would decrease by less than 5 %.
 SHARP_WORK = 0.05
+#: Largest bound of a sharp certificate: the active rows that an answer suggests may be
+#: wrong if its error is large. Without this limit, a bound of 0.64 became 1.8.
+MAX_SHARP_BOUND = 1e-2
 SHARP_BOUND = 1e-7  #: largest relative bound for which no further pair is tried
 #: Largest bound for which the closed rows are taken from the answer. If the error is
 #: larger, the solution for these rows may be far from the answer.
@@ -164,7 +167,7 @@ class Certificate:
         If the solution is not proven to be nonzero, the bound is infinite, or 0 if
         `error` is 0.
         """
-        return self._relative(self.error)
+        return _ratio(self.error, self.least)
 
     @property
     def error(self) -> float:
@@ -182,13 +185,8 @@ class Certificate:
             "moved": self.moved,
             "friction": _root(2 * self.sliding),
         }
-        relative = {name: self._relative(value) for name, value in lengths.items()}
+        relative = {name: _ratio(v, self.least) for name, v in lengths.items()}
         return relative | {"seminorm": float(self.seminorm)}
-
-    def _relative(self, length: float) -> float:
-        if not length:
-            return 0.0
-        return length / self.least if self.least > 0 else np.inf
 
 
 class EigenvalueCertificate(NamedTuple):
@@ -208,27 +206,27 @@ class EigenvalueCertificate(NamedTuple):
     @property
     def bound(self) -> float:
         """Bound relative to ‖x*‖_P; infinite if x* is not proven to be nonzero."""
-        return self._relative(self.error)
+        return _ratio(self.error, self.norm - self.distance)
 
     @property
     def parts(self) -> dict[str, float]:
         """Relative components of the bound; see `harness.verify.verdicts.certified`."""
+        least = self.norm - self.distance
         return {
-            "distance": self._relative(self.distance),
+            "distance": _ratio(self.distance, least),
             "answer": self.bound,
-            "moved": self._relative(self.moved),
+            "moved": _ratio(self.moved, least),
         }
 
-    def _relative(self, length: float) -> float:
-        least = self.norm - self.distance
-        if not length:
-            return 0.0
-        return length / least if least > 0 else np.inf
+
+def _ratio(length: float, least: float) -> float:
+    """Return length/least; 0 if `length` is 0, inf if `least` is not positive."""
+    if not length:
+        return 0.0
+    return length / least if least > 0 else np.inf
 
 
-@np.errstate(
-    all="ignore"
-)  # a point may contain 1e300; an overflow raises UncertifiableError
+@np.errstate(all="ignore")  # a point may contain 1e300, and its energy may overflow
 def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertificate:
     """Bound the error of x over convex sets by (5), from an eigenvalue of P.
 
@@ -289,9 +287,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     return certify_pair(bodies, s.x, mechanics.multipliers(s))
 
 
-@np.errstate(
-    all="ignore"
-)  # a point may contain 1e300; an overflow raises UncertifiableError
+@np.errstate(all="ignore")  # a point may contain 1e300, and its energy may overflow
 def certify_pair(
     bodies: Mechanics | DecomposedMechanics, claimed: Vector, multipliers: Vector
 ) -> Certificate:
@@ -300,10 +296,9 @@ def certify_pair(
     Up to four pairs (û, λ̂) are tried, and the certificate with the smallest `error` is
     returned:
 
-    1. the pair of the answer, changed as little as admissibility requires;
-    2. if the first pair yields no sharp certificate, as for an interior point with
-       positive multipliers and gaps: a pair with the active rows that the answer
-       suggests (first for decomposed bodies);
+    1. a pair with the active rows that the answer suggests;
+    2. if the first pair yields no sharp certificate: the pair of the answer, changed as
+       little as admissibility requires;
     3. if only contact supports an undivided body, and the first two pairs prove a bound
        of at most `MAX_EXCHANGE_BOUND` but no sharp one: the solution for the closed
        rows that the answer suggests, after at most `EXCHANGE_ROUNDS` exchanges of rows;
@@ -321,71 +316,15 @@ def certify_pair(
     """
     if not (np.isfinite(claimed).all() and np.isfinite(multipliers).all()):
         raise UncertifiableError("the answer contains NaN or inf")
-    if not isinstance(bodies, Mechanics):
-        divided = Subdomains(bodies)
-        return sharpest(
-            _certificates(divided, claimed, multipliers),
-            lambda: _at_rest(divided, claimed),
-        )
-    split = Undivided(bodies)
-    best = sharpest(
-        _certificates(split, claimed, multipliers), lambda: _at_rest(split, claimed)
-    )
-    best = including_lift(bodies, best)
-    if best.least >= best.error or bodies.lift.any():
+    split = Undivided(bodies) if isinstance(bodies, Mechanics) else Subdomains(bodies)
+    outcomes = list(_certificates(split, claimed, multipliers))
+    certificates = [c for c in outcomes if isinstance(c, Certificate)]
+    if not certificates:
+        raise UncertifiableError(f"no admissible pair near the answer: {outcomes[0]}")
+    best = min(certificates, key=lambda c: c.error)
+    if isinstance(split, Subdomains) or split.bodies.lift.any() or best.bound <= 1:
         return best
     return replace(best, least=max(best.least, _least_norm(split)))
-
-
-def including_lift(mechanics: Mechanics, certificate: Certificate) -> Certificate:
-    """Make a certificate relative to the whole displacement u* instead of u* − w.
-
-    With the displacements of the certificate, ‖u*‖ ≥ ‖û + w‖ − ‖û − (u* − w)‖.
-    """
-    if not mechanics.lift.any():
-        return certificate
-    total = mechanics.norm(certificate.u + mechanics.lift)
-    return replace(certificate, least=total - certificate.error, norm=total)
-
-
-def sharpest(
-    tried: Iterator[Certificate | str], at_rest: Callable[[], Certificate | str]
-) -> Certificate:
-    """Return the certificate with the smallest `error`.
-
-    Parameters
-    ----------
-    tried : certificates of pairs near the answer, or reasons why pairs have none
-    at_rest : returns the certificate of the pair near zero, or the reason why it has
-        none; called if no other pair proves a bound
-
-    Raises
-    ------
-    UncertifiableError
-        If no pair proves a bound; the message contains the first reason.
-
-    """
-    outcomes = list(tried)
-    certificates = [c for c in outcomes if isinstance(c, Certificate)]
-    if certificates:
-        return min(certificates, key=lambda c: c.error)
-    last = at_rest()
-    if isinstance(last, Certificate):
-        return last
-    raise UncertifiableError(f"no admissible pair near the answer: {outcomes[0]}")
-
-
-def _least_norm(split: Undivided) -> float:
-    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer.
-
-    The bound is 0 if the pair is not admissible.
-    """
-    mechanics = split.bodies
-    u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
-    try:
-        return proof(split, u, u, lam, active.closed).least
-    except UncertifiableError:
-        return 0.0
 
 
 def _certificates(
@@ -393,29 +332,24 @@ def _certificates(
 ) -> Iterator[Certificate | str]:
     """Yield certificates of pairs, or reasons for their absence, until one is sharp."""
     exact, u = split.exact, split.free(claimed.astype(Real))
-    lam = exact.forces.project(multipliers.astype(Real))
-    active = suggested(exact, u, lam)
-    complementary = active.at_bounds(lam), active.closed
-    pairs = [(lam, np.zeros(lam.size, dtype=bool)), complementary]
-    bound = np.inf
-    for pair in pairs if isinstance(split, Undivided) else pairs[::-1]:
-        outcome = _proved(split, claimed, u, *pair)
+    lam, bounds = exact.forces.project(multipliers.astype(Real)), list[float]()
+    active, none = suggested(exact, u, lam), np.zeros(lam.size, dtype=bool)
+    for forces, closed in (active.at_bounds(lam), active.closed), (lam, none):
+        outcome = _proved(split, claimed, u, forces, closed)
         yield outcome
         if is_sharp(outcome):
             return
         if isinstance(outcome, Certificate):
-            bound = min(bound, outcome.bound)
-    if not isinstance(split, Undivided) or not split.motions.all.shape[1]:
-        return
-    if SHARP_BOUND < bound <= MAX_EXCHANGE_BOUND:
+            bounds.append(outcome.bound)
+    if not bounds:
+        yield _proved(split, claimed, 0 * split.exact.f, 0 * lam, none)
+    elif (
+        isinstance(split, Undivided)
+        and split.motions.all.shape[1]
+        and SHARP_BOUND < min(bounds) <= MAX_EXCHANGE_BOUND
+    ):
         v, mu, active = exchanged(split.bodies, active, EXCHANGE_ROUNDS)
         yield _proved(split, claimed, v, mu, active.closed)
-
-
-def _at_rest(split: Split, claimed: Vector) -> Certificate | str:
-    """Return the certificate of the pair near zero, or the reason why it is missing."""
-    u, lam = np.zeros_like(split.exact.f), np.zeros_like(split.exact.c)
-    return _proved(split, claimed, u, lam, np.zeros(lam.size, dtype=bool))
 
 
 def _proved(split: Split, *pair: Any) -> Certificate | str:
@@ -426,11 +360,22 @@ def _proved(split: Split, *pair: Any) -> Certificate | str:
         return str(e)
 
 
+def _least_norm(split: Undivided) -> float:
+    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer.
+
+    The bound is 0 if the pair is not admissible.
+    """
+    u, lam, active = exchanged(split.bodies, unconstrained_guess(split.bodies))
+    found = _proved(split, u, u, lam, active.closed)
+    return found.least if isinstance(found, Certificate) else 0.0
+
+
 def is_sharp(outcome: Certificate | str) -> bool:
     """Return True if the bound is small, or another pair could hardly improve it."""
-    return isinstance(outcome, Certificate) and (
-        outcome.work <= SHARP_WORK * outcome.distance**2 or outcome.bound <= SHARP_BOUND
-    )
+    if not isinstance(outcome, Certificate):
+        return False
+    without_work = outcome.work <= SHARP_WORK * outcome.distance**2
+    return outcome.bound <= (MAX_SHARP_BOUND if without_work else SHARP_BOUND)
 
 
 def proof(
@@ -465,7 +410,7 @@ def _evaluated(
     split: Split, claimed: Vector | Extended, u: Extended, lam: Extended
 ) -> Certificate:
     """Evaluate (4) and (3) for the admissible pair û (n,) and λ̂ (m,)."""
-    exact, motions, G = split.exact, split.motions, split.motions.G
+    exact, motions = split.exact, split.motions
     motion = exact.motion(u)
     pressing, sliding = (w.sum() for w in exact.missing_work(lam, motion))
     work = float(pressing + sliding)
@@ -473,13 +418,17 @@ def _evaluated(
     near = neighbour(split, at_u.rho + split.pulled(lam))
     drift = motions.without(claimed - u)
     moved = split.spread(drift)
-    K_moved = split.product(moved)
-    u_u, u_d, d_d, moved_moved, moved_d = (float(a @ b) for a, b in (
-        (at_u.v, at_u.Kv), (at_u.v, near.Kd), (near.d, near.Kd),
-        (moved, K_moved), (moved, near.Kd),
-    ))  # fmt: skip
-    supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
-    p, noise = G.shape[1], split.noise(u)
+    moved_moved = float(moved @ split.product(moved))
+    u_u, u_d = at_u.square, float(at_u.v @ near.Kd)
+    d_d, moved_d = (float(v @ near.Kd) for v in (near.d, moved))
+    weights = relative(exact.forces.interior(lam))
+    supported, _ = supported_and_floating(motions.G, weights)
+    p, noise = motions.G.shape[1], split.noise(u)
+
+    def along(alpha: Extended) -> Vector:
+        """Return the magnitudes (h,) of Rα along the supported motions."""
+        return np.asarray(np.abs(supported.T @ alpha[:p]), dtype=np.float64)
+
     theta, off = at_u.theta, None
     # If û is small, its θ may differ from the θ of the error. For û = 0, θ is 0.
     if u_u < 4 * d_d:
@@ -490,9 +439,8 @@ def _evaluated(
     square = total * total + 2 * work
     known = split.rounding(supported)
     reach = _reach(split, supported, lam, -motion, square)
-    unbalanced = np.abs(supported.T @ near.unbalanced[:p])
-    scattered = np.abs(supported.T) @ split.scattered(noise)[:p]
-    pull = (unbalanced + scattered).astype(np.float64)
+    scattered = np.abs(supported.T) @ split.scattered(noise)
+    pull = along(near.unbalanced) + scattered.astype(np.float64)
     rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
         raise UncertifiableError(
@@ -502,17 +450,17 @@ def _evaluated(
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
-    further = np.abs(supported.T @ motions.along(claimed - u)[:p]).astype(np.float64)
-    gamma = reach.within(2 * gap) + further
-    in_K = known.stored(from_middle + around, gamma, theta)
+    gamma = reach.within(2 * gap) + along(motions.along(claimed - u))
+    size = from_middle + around  # bound on ‖e'‖ in K_T
+    in_K = _root(size * size + known.work(size, gamma, theta))
     # the energy in K_T of bodies that move together with their supports is zero
     if off is not None:
-        turned = np.abs(supported.T @ motions.along(off[0])[:p]).astype(np.float64)
-        pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
+        turned = float(gamma @ along(motions.along(off[0])))
+        pull_off = _root(2 * gap) * length(split, off[0]) + turned
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
     stretch = _root(1 + theta)
     # ‖M‖ − around ≥ ‖û‖ − √(2g) and ≥ ‖u_λ‖ − √(2g), up to the residual of the solve
-    least = _root(u_u - u_d + 0.25 * d_d) - around
+    least = (_root(u_u - u_d + 0.25 * d_d) - around) / stretch
     certificate = Certificate(
         u=u,
         multipliers=lam,
@@ -524,12 +472,16 @@ def _evaluated(
         rounding=rounding,
         claimed=in_K,
         stretch=stretch,
-        least=least / stretch,
+        least=least,
         moved=_root(moved_moved),
         seminorm=near.unbalanced.size > 0,
     )
     if not np.isfinite(certificate.error):
         raise UncertifiableError("the answer is too large: its energy overflows")
+    if isinstance(split, Undivided) and split.bodies.lift.any():
+        # errors are relative to u* + w, and ‖u* + w‖ ≥ ‖û + w‖ − ‖û − u*‖
+        whole = split.bodies.norm(u + split.bodies.lift)
+        return replace(certificate, least=whole - certificate.error, norm=whole)
     return certificate
 
 
@@ -618,11 +570,7 @@ def _reach(
             forces = np.zeros_like(lam)
             forces[up] = y[: up.sum()]
             forces[down] -= y[up.sum() :]
-            bound = (
-                opened @ y,
-                length(split, split.pulled(forces)),
-                (pressed * y).max(initial=0.0),
-            )
+            bound = opened @ y, length(split, split.pulled(forces)), (pressed * y).max()
             bounds[:, k] = np.maximum(bounds[:, k], bound)
     # each combination equals ±γₖ up to COMBINATION_RESIDUAL·‖γ‖, and ‖γ‖ is at most the
     # sum of the bounds on |γₖ|

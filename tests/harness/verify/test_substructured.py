@@ -17,28 +17,23 @@ from numpy.testing import assert_allclose
 from scipy.sparse import block_diag
 
 from mortarbench.harness import Mechanics, Solution, Status, UncertifiableError, certify
-from mortarbench.harness.mechanics import Extended, Real
+from mortarbench.harness.mechanics import DecomposedMechanics, Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.sets.convex import hull
-from mortarbench.harness.verify.certificate import Certificate
-from mortarbench.harness.verify.over_ranks import (
-    LocalBodies,
-    _OnRanks,
-    certify_over_ranks,
-)
+from mortarbench.harness.verify.certificate import Certificate, certify_pair
 from mortarbench.harness.verify.references import ReferencePoint, reference_point
-from mortarbench.harness.verify.substructured import neighbour, without_rigid_motion
+from mortarbench.harness.verify.substructured import Subdomains, neighbour
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
-from mortarbench.problems.feti.local_bodies import local_bodies
-from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
-from tests.support.decomposed_bodies import labelled, parts_by
+from tests.support.bound_search import BoundSearch
+from tests.support.decomposed_bodies import labelled, mechanics_of, parts_by
 from tests.support.disturbed import DISTURBANCES
+from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
 
 pytestmark = pytest.mark.together
 CASES = (
@@ -82,7 +77,7 @@ class Known:
 
     mechanics: Mechanics
     exact: ReferencePoint
-    own: LocalBodies
+    own: DecomposedMechanics
 
     def solution(self) -> Solution:
         """Return the solution in the form of `Mechanics.to_primal`."""
@@ -116,12 +111,11 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     def never() -> Any:
         raise AssertionError("certificates of subdomains need no factor of the whole")
 
-    subdomains = on_one_process(parts_by(bodies, layout, whole.primal, whole.friction))
-    own = local_bodies(subdomains)
+    own = mechanics_of(parts_by(bodies, layout, whole.primal, whole.friction))
     mechanics = replace(
         whole,
         factorise=never,
-        certify_by_subdomains=lambda u, z: certify_over_ranks(own, u, z),
+        subdomains=lambda: own,
     )
     vars(mechanics)["whole"] = whole
     return Known(mechanics, reference_point(whole, reference_solution), own)
@@ -256,7 +250,7 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
     rng, exact = np.random.default_rng(5), problem.exact
     u = exact.u + 1e-3 * np.abs(exact.u).max() * rng.standard_normal(exact.u.size)
     u[mechanics.exact.fixed] = 0
-    split = _OnRanks(problem.own)
+    split = Subdomains(problem.own)
     near = neighbour(split, split.residual(u).rho + split.pulled(exact.multipliers))
     held = mechanics.exact.fixed
     b = parts.product(near.d)
@@ -275,14 +269,13 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
 def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
     problem, rng = known(name), np.random.default_rng(8)
     mechanics, parts = problem.mechanics, problem.own.parts
-    split = _OnRanks(problem.own)
+    split = Subdomains(problem.own)
     u = rng.standard_normal(mechanics.exact.f.size).astype(Real)
     u[mechanics.exact.fixed] = 0
     apart = parts.kernel @ rng.standard_normal(parts.kernel.shape[1])
     together = split.averaged(split.spread(u) + 100 * apart)
-    left = without_rigid_motion(
-        split, together - u
-    )  # only contact supports a body of the patch
+    # only contact supports a body of the patch
+    left = split.motions.without(together - u)
 
     assert np.abs(left).max() < 1e-9
 
@@ -290,7 +283,8 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
 def test_local_problems_are_those_of_the_decomposed_bodies() -> None:
     parts = known(CASES[0]).own.parts
     assert isinstance(parts, LocalProblems)
-    K = block_diag([parts.torn.classes[k].K for k in parts.torn.class_of])
+    domains = parts.torn.domains
+    K = block_diag([domains.template(k).K for k in domains.class_of])
     rng = np.random.default_rng(6)
     v = rng.standard_normal(K.shape[0])
     b = v - parts.kernel @ (parts.kernel.T @ v)
@@ -314,9 +308,10 @@ def test_local_solves_ignore_and_exclude_rigid_motions() -> None:
 
 def test_an_unbalanced_load_has_no_certificate() -> None:
     problem = known("contact-patch/ratio=0.1")
-    own, s = replace(problem.own, f=-problem.own.f), problem.solution()
+    own, s = problem.own, problem.solution()
+    lifted = replace(own, exact=own.exact._replace(f=-own.exact.f))
     with pytest.raises(UncertifiableError, match="tensile"):
-        certify_over_ranks(own, s.x, problem.mechanics.multipliers(s))
+        certify_pair(lifted, s.x, problem.mechanics.multipliers(s))
 
 
 @pytest.mark.parametrize("size", [1e160, 1e300])
@@ -329,3 +324,69 @@ def test_answers_that_overflow_have_no_bound_below_one(size: float) -> None:
         except UncertifiableError:
             continue
         assert found.bound >= 1
+
+
+SEARCHED = (
+    "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual", "membranes/S=3/n=2/dual",
+    "contact-patch/ratio=0.1/feti=3/dual",
+    "contact-patch/ratio=0.1/friction=coulomb/mu=0.2/feti=3/dual",
+    "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual",
+    "greco/n=4/dim=3/depth=2/feti=2/dual",
+    "sliding disc", "disc under rollers", "tilted disc", "soft disc",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        (SEARCHED[1], 8), (SEARCHED[7], 8),
+        *(pytest.param(name, 60, marks=pytest.mark.slow) for name in SEARCHED),
+    ],
+)  # fmt: skip
+def test_a_search_finds_no_answer_whose_error_exceeds_its_bound(
+    name: str, count: int
+) -> None:
+    faults, sharp = BoundSearch(name).result(count)
+
+    assert faults == []
+    assert len(sharp) == count
+    assert np.median(sharp) < 2
+
+
+@pytest.mark.parametrize(
+    ("sign", "push", "reason"),
+    [
+        (1, 0.1, "nothing balances the load of body upper along x"),
+        (-1, 0.0, "only tensile contact forces"),
+    ],
+)
+def test_an_unbalanced_load_is_refused_as_for_undivided_bodies(
+    sign: int, push: float, reason: str
+) -> None:
+    parts = disc_in_parts(push=push)
+    load = parts.load
+    parts = replace(parts, load=lambda at: sign * load(at))
+    whole = disc_between_plates(push=push).mechanics
+    assert whole is not None
+    whole = replace(whole, primal=replace(whole.primal, q=sign * whole.primal.q))
+    u, z = 0 * whole.primal.q, 0 * whole.primal.h
+    reasons = []
+    for bodies in (whole, mechanics_of(parts)):
+        with pytest.raises(UncertifiableError, match=reason) as refusal:
+            certify_pair(bodies, u, z)
+        reasons.append(str(refusal.value))
+
+    assert reasons[0] == reasons[1]
+
+
+def test_eliminated_supports_are_certified_in_floating_subdomains() -> None:
+    """The undivided body has the u_λ that is the nearest to û."""
+    name = "plate/Sx=1/Sy=4/n=2/supports=eliminated/dual"
+    mechanics = parse(name, PROBLEMS).build(reference_solution).mechanics
+    assert mechanics is not None
+    point = reference_point(mechanics, reference_solution)
+    u, none = 1.01 * point.u.astype(np.float64), np.zeros(0)
+    s = Solution(status=Status.SOLVED, x=u, y=none, z=none, z_box=0 * u)
+    divided, undivided = (certify(m, s).bound for m in (mechanics, mechanics.whole))
+
+    assert 0.999 * undivided <= divided <= 2 * undivided < 1
