@@ -185,7 +185,7 @@ class Subdomains:
     template: Callable[[int], SubdomainClass]
     sizes: NDArray[np.int64]  #: (classes,) number of torn unknowns of a subdomain
     class_of: NDArray[np.int64]  #: (S,) class of each subdomain
-    rank: NDArray[np.int64]  #: (S,) rank of each subdomain
+    rank: NDArray[np.int64]  #: (S,) rank of each subdomain, ascending
     comm: Comm = SERIAL
 
     @cached_property
@@ -247,17 +247,17 @@ class Subdomains:
 
     def combined(self, v: NDArray[Any]) -> NDArray[Any]:
         """Complete a torn vector (N,) with the subdomains of the other ranks."""
-        if self.comm.size > 1:
-            rank_of, own = self._rank_of, self.comm.rank
-            parts = self.comm.gather(v[rank_of == own] if own else v[:0])
-            for rank, part in enumerate(parts[1:], 1):
-                v[rank_of == rank] = part
+        for rank, part in enumerate(
+            self.comm.gather(v[self._unknowns(self.comm.rank)])
+        ):
+            if rank:  # the part of rank 0 is in place
+                v[self._unknowns(rank)] = part
         return v
 
-    @cached_property
-    def _rank_of(self) -> NDArray[np.int16]:
-        """Rank of each torn unknown, (N,)."""
-        return np.repeat(self.rank.astype(np.int16), np.diff(self.start))
+    def _unknowns(self, rank: int) -> slice:
+        """Return the torn unknowns of the subdomains of a rank."""
+        first, end = np.searchsorted(self.rank, [rank, rank + 1])
+        return slice(self.start[first], self.start[end])
 
     def inverse(self, b: Vector) -> Vector:
         """Apply K⁺ to a torn vector (N,)."""

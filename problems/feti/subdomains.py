@@ -35,12 +35,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array
+from scipy.sparse import bsr_array, csr_array
 
-from mortarbench.harness import Vector
+from mortarbench.harness import InputError, Vector
 from mortarbench.harness.distributed.comm import SERIAL, Comm
+from mortarbench.harness.distributed.mpi import too_few_parts
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.balance import balanced_partition
 from mortarbench.problems.feti.subdivision import (
     Integers,
     Subdivision,
@@ -221,7 +221,7 @@ class TornBodies:
             return problem.assemble_class(SubdomainMesh(of_class[k], cells, of_cells))
 
         sizes = problem.components * np.array([len(at) for at in of_class])
-        rank = self.comm.bcast(subdomain_ranks(problem, self.comm.size))
+        rank = subdomain_ranks(problem, self.comm.size)
         domains = Subdomains(
             template=cache(template),
             sizes=sizes,
@@ -327,7 +327,10 @@ class Rows(NamedTuple):
 
 
 def subdomain_ranks(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
-    """Return the rank (S,) of each subdomain, balancing work and memory.
+    """Return the rank (S,) of each subdomain; the ranks have consecutive subdomains.
+
+    Products with the dual operator sum whole vectors, so that the ranks need not have
+    few common rows. The work of a product and the number of nodes are balanced.
 
     Raises
     ------
@@ -335,19 +338,21 @@ def subdomain_ranks(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]
         If there are fewer subdomains than ranks.
 
     """
-    of, d = problem.layout, problem.components
-    S = of.count
-    if ranks == 1:
-        return np.zeros(S, dtype=np.int64)
-    one, other, nodes = of.shared_node_counts()
-    graph = coo_array((d * nodes, (one, other)), shape=(S, S))
+    of, S = problem.layout, problem.layout.count
+    if S < ranks:
+        raise InputError(too_few_parts(S, ranks))
     touched = of.glued()
+    d = problem.components
     node = np.unique(np.concatenate([problem.fixed, problem.contact.rows.indices]) // d)
-    single = of.multiplicity(node) == 1
-    touched = touched + np.bincount(of.holder(node[single]), minlength=S)
-    return balanced_partition(
-        csr_array(graph + graph.T), (d * touched) ** 2, of.sizes, ranks
-    )
+    single = node[of.multiplicity(node) == 1]
+    touched = touched + np.bincount(of.holder(single), minlength=S)
+    work = touched**2 / max((touched**2).sum(), 1) + of.sizes / of.sizes.sum()
+    middle = np.cumsum(work) - work / 2
+    first = np.searchsorted(middle, np.arange(1, ranks) * work.sum() / ranks)
+    for k in range(ranks - 1):  # no rank is idle
+        least = first[k - 1] + 1 if k else 1
+        first[k] = min(max(first[k], least), S - ranks + 1 + k)
+    return np.searchsorted(first, np.arange(S), side="right")
 
 
 def _rows(torn: TornBodies) -> Rows:
