@@ -86,12 +86,15 @@ def _feasible_near(
     """
     B, c, contact = exact.B, exact.c, exact.contact
     at = np.unique(B.indices)
+    magnitude = abs(B[:, at])
     enforced = np.zeros_like(closed)
     moved, step = u, None
     for _ in range(MAX_ROUNDS):
         gap = c - B @ moved
-        size = np.abs(moved[at]).max(initial=Real(0))  # bounds the correction's terms
-        margin = _EPS * (abs(B) @ (16 * np.abs(moved) + 4 * size) + 16 * np.abs(c))
+        near = np.abs(moved[at])
+        # the largest displacement bounds the terms of the correction
+        reach = magnitude @ (16 * near + 4 * near.max(initial=Real(0)))
+        margin = _EPS * (reach + 16 * np.abs(c))
         required = enforced | closed | (contact & (gap < 0))
         if not required.any():
             return u
@@ -251,6 +254,8 @@ def balanced(
 
     """
     exact, motions = bodies.exact, bodies.motions
+    if not motions.all.shape[1]:
+        return multipliers
     free, f, size = motions.free, exact.f, np.abs(exact.f)
     if free.shape[1]:
         largest = abs(free).max(axis=0).toarray().ravel()

@@ -111,6 +111,9 @@ POWER_ITERATION_FACTOR = 2.0
 #: A certificate is sharp if its `work` is at most this fraction of its squared
 #: `distance` d: without work, the bound √(d² + 2·work) would decrease by less than 5 %.
 SHARP_WORK = 0.05
+#: Largest bound of a sharp certificate: the active rows that an answer suggests may be
+#: wrong if its error is large. Without this limit, a bound of 0.64 became 1.8.
+MAX_SHARP_BOUND = 1e-2
 SHARP_BOUND = 1e-7  #: largest relative bound for which no further pair is tried
 #: Largest bound for which the closed rows are taken from the answer. If the error is
 #: larger, the solution for these rows may be far from the answer.
@@ -300,10 +303,9 @@ def certify_pair(
     Up to four pairs (û, λ̂) are tried, and the certificate with the smallest `error` is
     returned:
 
-    1. the pair of the answer, changed as little as admissibility requires;
-    2. if the first pair yields no sharp certificate, as for an interior point with
-       positive multipliers and gaps: a pair with the active rows that the answer
-       suggests (first for decomposed bodies);
+    1. a pair with the active rows that the answer suggests;
+    2. if the first pair yields no sharp certificate: the pair of the answer, changed as
+       little as admissibility requires;
     3. if only contact supports an undivided body, and the first two pairs prove a bound
        of at most `MAX_EXCHANGE_BOUND` but no sharp one: the solution for the closed
        rows that the answer suggests, after at most `EXCHANGE_ROUNDS` exchanges of rows;
@@ -321,18 +323,14 @@ def certify_pair(
     """
     if not (np.isfinite(claimed).all() and np.isfinite(multipliers).all()):
         raise UncertifiableError("the answer contains NaN or inf")
-    if not isinstance(bodies, Mechanics):
-        divided = Subdomains(bodies)
-        return sharpest(
-            _certificates(divided, claimed, multipliers),
-            lambda: _at_rest(divided, claimed),
-        )
-    split = Undivided(bodies)
+    split = Undivided(bodies) if isinstance(bodies, Mechanics) else Subdomains(bodies)
     best = sharpest(
         _certificates(split, claimed, multipliers), lambda: _at_rest(split, claimed)
     )
-    best = including_lift(bodies, best)
-    if best.least >= best.error or bodies.lift.any():
+    if not isinstance(split, Undivided):
+        return best
+    best = including_lift(split.bodies, best)
+    if best.least >= best.error or split.bodies.lift.any():
         return best
     return replace(best, least=max(best.least, _least_norm(split)))
 
@@ -396,9 +394,9 @@ def _certificates(
     lam = exact.forces.project(multipliers.astype(Real))
     active = suggested(exact, u, lam)
     complementary = active.at_bounds(lam), active.closed
-    pairs = [(lam, np.zeros(lam.size, dtype=bool)), complementary]
+    pairs = complementary, (lam, np.zeros(lam.size, dtype=bool))
     bound = np.inf
-    for pair in pairs if isinstance(split, Undivided) else pairs[::-1]:
+    for pair in pairs:
         outcome = _proved(split, claimed, u, *pair)
         yield outcome
         if is_sharp(outcome):
@@ -428,9 +426,10 @@ def _proved(split: Split, *pair: Any) -> Certificate | str:
 
 def is_sharp(outcome: Certificate | str) -> bool:
     """Return True if the bound is small, or another pair could hardly improve it."""
-    return isinstance(outcome, Certificate) and (
-        outcome.work <= SHARP_WORK * outcome.distance**2 or outcome.bound <= SHARP_BOUND
-    )
+    if not isinstance(outcome, Certificate):
+        return False
+    without_work = outcome.work <= SHARP_WORK * outcome.distance**2
+    return outcome.bound <= (MAX_SHARP_BOUND if without_work else SHARP_BOUND)
 
 
 def proof(
@@ -465,7 +464,7 @@ def _evaluated(
     split: Split, claimed: Vector | Extended, u: Extended, lam: Extended
 ) -> Certificate:
     """Evaluate (4) and (3) for the admissible pair û (n,) and λ̂ (m,)."""
-    exact, motions, G = split.exact, split.motions, split.motions.G
+    exact, motions = split.exact, split.motions
     motion = exact.motion(u)
     pressing, sliding = (w.sum() for w in exact.missing_work(lam, motion))
     work = float(pressing + sliding)
@@ -473,13 +472,17 @@ def _evaluated(
     near = neighbour(split, at_u.rho + split.pulled(lam))
     drift = motions.without(claimed - u)
     moved = split.spread(drift)
-    K_moved = split.product(moved)
-    u_u, u_d, d_d, moved_moved, moved_d = (float(a @ b) for a, b in (
-        (at_u.v, at_u.Kv), (at_u.v, near.Kd), (near.d, near.Kd),
-        (moved, K_moved), (moved, near.Kd),
-    ))  # fmt: skip
-    supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
-    p, noise = G.shape[1], split.noise(u)
+    moved_moved = float(moved @ split.product(moved))
+    u_u, u_d = at_u.square, float(at_u.v @ near.Kd)
+    d_d, moved_d = (float(v @ near.Kd) for v in (near.d, moved))
+    weights = relative(exact.forces.interior(lam))
+    supported, _ = supported_and_floating(motions.G, weights)
+    p, noise = motions.G.shape[1], split.noise(u)
+
+    def along(alpha: Extended) -> Vector:
+        """Return the magnitudes (h,) of Rα along the supported motions."""
+        return np.asarray(np.abs(supported.T @ alpha[:p]), dtype=np.float64)
+
     theta, off = at_u.theta, None
     # If û is small, its θ may differ from the θ of the error. For û = 0, θ is 0.
     if u_u < 4 * d_d:
@@ -490,9 +493,8 @@ def _evaluated(
     square = total * total + 2 * work
     known = split.rounding(supported)
     reach = _reach(split, supported, lam, -motion, square)
-    unbalanced = np.abs(supported.T @ near.unbalanced[:p])
-    scattered = np.abs(supported.T) @ split.scattered(noise)[:p]
-    pull = (unbalanced + scattered).astype(np.float64)
+    scattered = np.abs(supported.T) @ split.scattered(noise)
+    pull = along(near.unbalanced) + scattered.astype(np.float64)
     rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
         raise UncertifiableError(
@@ -502,13 +504,12 @@ def _evaluated(
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
-    further = np.abs(supported.T @ motions.along(claimed - u)[:p]).astype(np.float64)
-    gamma = reach.within(2 * gap) + further
+    gamma = reach.within(2 * gap) + along(motions.along(claimed - u))
     in_K = known.stored(from_middle + around, gamma, theta)
     # the energy in K_T of bodies that move together with their supports is zero
     if off is not None:
-        turned = np.abs(supported.T @ motions.along(off[0])[:p]).astype(np.float64)
-        pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
+        turned = float(gamma @ along(motions.along(off[0])))
+        pull_off = _root(2 * gap) * length(split, off[0]) + turned
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
     stretch = _root(1 + theta)
     # ‖M‖ − around ≥ ‖û‖ − √(2g) and ≥ ‖u_λ‖ − √(2g), up to the residual of the solve

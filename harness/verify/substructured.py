@@ -74,11 +74,11 @@ REFINEMENT_TOLERANCE = 1e-6
 
 
 class Residual(NamedTuple):
-    """Residual of a displacement u, and products of its deformation u − RRᵀu."""
+    """Residual of a displacement u, and the energy of its deformation u − RRᵀu."""
 
     rho: Extended  #: (n,)  Ku − f
     v: Extended  #: (N,)  T(u − RRᵀu)
-    Kv: Extended  #: (N,)  K_T v
+    square: float  #: vᵀK_T v
     theta: float  #: estimated relative difference of the energies of u in K and K_T
 
 
@@ -155,7 +155,7 @@ class Split(ABC):
         """Return sums (n,) of the squared terms of Ku."""
 
     @abstractmethod
-    def theta(self, deformed: Extended, square: Any) -> float:
+    def theta(self, deformed: Extended, square: float) -> float:
         """Estimate the relative difference of the energies in K and K_T.
 
         deformed : (n,) displacement without rigid motion
@@ -176,7 +176,7 @@ class Split(ABC):
         return self.free(np.asarray(self.exact.B.T @ multipliers))
 
     def residual(self, u: Extended) -> Residual:
-        """Return Ku − f, and K_T v for v = T(u − RRᵀu).
+        """Return Ku − f, and vᵀK_T v for v = T(u − RRᵀu).
 
         With the projection of Kv onto R, the product of K with rigid motions R is KR,
         which is computed by `cancelling`, since its terms cancel. The rounding of K
@@ -189,7 +189,8 @@ class Split(ABC):
         rho = self.joined(Kv) - self.exact.f
         if R.shape[1]:
             rho += KR @ (R.T @ u) + R @ (KR.T @ deformed)
-        return Residual(self.free(rho), v, Kv, self.theta(deformed, v @ Kv))
+        square = float(v @ Kv)
+        return Residual(self.free(rho), v, square, self.theta(deformed, square))
 
     def noise(self, u: Extended) -> Extended:
         """Return a sample (n,) of the rounding of Ku."""
@@ -210,11 +211,11 @@ class Split(ABC):
         return self.free(Kw - self.joined(Kv)), abs(float(w @ Kw - v @ Kv))
 
     def scattered(self, v: Extended) -> Extended:
-        """Return the standard deviation (r,) of Rᵀv for random signs of v (n,).
+        """Return the standard deviation (p,) of Rᵀv for random signs of v (n,).
 
-        This is √((R∘R)ᵀ(v∘v)).
+        This is √((R∘R)ᵀ(v∘v)), where R contains the motions that change gaps or slip.
         """
-        R = self.motions.all
+        R = self.motions.constrained
         return np.asarray(np.sqrt(R.multiply(R).T @ v**2))
 
 
@@ -309,7 +310,7 @@ class Undivided(Split):
         K = csc_array(self.bodies.primal.P).power(2)
         return np.asarray(K @ self.motions.without(u).astype(np.float64) ** 2)
 
-    def theta(self, deformed: Extended, square: Any) -> float:
+    def theta(self, deformed: Extended, square: float) -> float:
         """Return 0, since K_T and K define the same norm."""
         del deformed, square
         return 0.0
@@ -407,19 +408,18 @@ class Subdomains(Split):
         squares = self.spread(u).astype(np.float64) ** 2
         return np.asarray(self._squares.T @ self._parts.squared_product(squares))
 
-    def theta(self, deformed: Extended, square: Any) -> float:
+    def theta(self, deformed: Extended, square: float) -> float:
         """Estimate the relative difference of energies by `noise`."""
         off = np.sqrt(deformed**2 @ self.noise(deformed) ** 2)
         return SAFETY * float(off / square) if square > 0 else 0.0
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
         """Return bounds on ER from samples."""
-        R, p = self.motions.constrained, supported.shape[0]
-        off = [self.noise(R @ k) for k in supported.T]
+        off = [self.noise(self.motions.constrained @ k) for k in supported.T]
         strain, curvature = np.zeros(len(off)), np.zeros((len(off), len(off)))
         for k, v in enumerate(off):
             strain[k] = length(self, v)
-            curvature[k] = np.abs(supported.T) @ self.scattered(v)[:p]
+            curvature[k] = np.abs(supported.T) @ self.scattered(v)
         return Rounding(strain, curvature)
 
 

@@ -332,8 +332,8 @@ def test_a_body_may_have_slid_by_its_displacement_in_either_direction(far, monke
     problem, seen = known(INCLINE), []
     mechanics, reach = problem.mechanics, certificate._reach
 
-    def recorded(split, exact, G, held, *others):
-        seen.append((held, reach(split, exact, G, held, *others)))
+    def recorded(split, held, *others):
+        seen.append((held, reach(split, held, *others)))
         return seen[-1][1]
 
     monkeypatch.setattr(certificate, "_reach", recorded)

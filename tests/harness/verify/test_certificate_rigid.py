@@ -418,7 +418,7 @@ def test_an_answer_whose_own_pair_proves_nothing_has_a_sharp_bound(name, size, r
     mechanics, u, lam, length = known(name)
     far = _noise(mechanics, answer(u, lam), size, np.random.default_rng(0))
     with np.errstate(over="ignore"):  # as in `certify`
-        tried = list(certificate._certificates(Undivided(mechanics), far))
+        tried = list(certificate._certificates(Undivided(mechanics), far.x, far.z))
     found = certify(mechanics, far)
     off, *others = errors_of(mechanics, u, far, found)
 
@@ -564,8 +564,8 @@ def test_rows_are_exchanged_if_only_contact_supports_a_body(
     """Certificates are replaced by certificates whose only error is work."""
     mechanics, u, lam, _ = known(name)
     monkeypatch.setattr(certificate, "_proved", lambda *args: pair(work=bound**2 / 2))
-    split = Undivided(mechanics)
-    assert len(list(certificate._certificates(split, answer(u, lam)))) == count
+    split, s = Undivided(mechanics), answer(u, lam)
+    assert len(list(certificate._certificates(split, s.x, s.z))) == count
 
 
 @pytest.mark.parametrize("name", ["disc under rollers", "tilted disc", RATIOS[3]])
@@ -574,8 +574,8 @@ def test_motions_in_both_directions_are_bounded(name, monkeypatch):
     mechanics, u, lam, _ = known(name)
     reach, seen = certificate._reach, []
 
-    def both(split, exact, G, held, *others):
-        seen.append([reach(split, exact, G, h, *others) for h in (held, -held)])
+    def both(split, held, *others):
+        seen.append([reach(split, h, *others) for h in (held, -held)])
         return seen[-1][0]
 
     monkeypatch.setattr(certificate, "_reach", both)

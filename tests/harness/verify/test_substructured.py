@@ -17,22 +17,19 @@ from numpy.testing import assert_allclose
 from scipy.sparse import block_diag
 
 from mortarbench.harness import Mechanics, Solution, Status, UncertifiableError, certify
-from mortarbench.harness.mechanics import Extended, Real
+from mortarbench.harness.mechanics import DecomposedMechanics, Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.sets.convex import hull
-from mortarbench.harness.verify.certificate import Certificate
-from mortarbench.harness.verify.over_ranks import (
-    LocalBodies,
-    _OnRanks,
-    certify_over_ranks,
-)
+from mortarbench.harness.verify.certificate import Certificate, certify_pair
 from mortarbench.harness.verify.references import ReferencePoint, reference_point
-from mortarbench.harness.verify.substructured import neighbour, without_rigid_motion
+from mortarbench.harness.verify.substructured import Subdomains, neighbour
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
-from mortarbench.problems.feti.local_bodies import local_bodies
 from mortarbench.problems.feti.subdomains import on_one_process
-from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.substructures import (
+    LocalProblems,
+    decomposed_mechanics,
+)
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
@@ -82,7 +79,7 @@ class Known:
 
     mechanics: Mechanics
     exact: ReferencePoint
-    own: LocalBodies
+    own: DecomposedMechanics
 
     def solution(self) -> Solution:
         """Return the solution in the form of `Mechanics.to_primal`."""
@@ -117,11 +114,11 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
         raise AssertionError("certificates of subdomains need no factor of the whole")
 
     subdomains = on_one_process(parts_by(bodies, layout, whole.primal, whole.friction))
-    own = local_bodies(subdomains)
+    own = decomposed_mechanics(subdomains)()
     mechanics = replace(
         whole,
         factorise=never,
-        certify_by_subdomains=lambda u, z: certify_over_ranks(own, u, z),
+        subdomains=lambda: own,
     )
     vars(mechanics)["whole"] = whole
     return Known(mechanics, reference_point(whole, reference_solution), own)
@@ -256,7 +253,7 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
     rng, exact = np.random.default_rng(5), problem.exact
     u = exact.u + 1e-3 * np.abs(exact.u).max() * rng.standard_normal(exact.u.size)
     u[mechanics.exact.fixed] = 0
-    split = _OnRanks(problem.own)
+    split = Subdomains(problem.own)
     near = neighbour(split, split.residual(u).rho + split.pulled(exact.multipliers))
     held = mechanics.exact.fixed
     b = parts.product(near.d)
@@ -275,14 +272,13 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
 def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
     problem, rng = known(name), np.random.default_rng(8)
     mechanics, parts = problem.mechanics, problem.own.parts
-    split = _OnRanks(problem.own)
+    split = Subdomains(problem.own)
     u = rng.standard_normal(mechanics.exact.f.size).astype(Real)
     u[mechanics.exact.fixed] = 0
     apart = parts.kernel @ rng.standard_normal(parts.kernel.shape[1])
     together = split.averaged(split.spread(u) + 100 * apart)
-    left = without_rigid_motion(
-        split, together - u
-    )  # only contact supports a body of the patch
+    # only contact supports a body of the patch
+    left = split.motions.without(together - u)
 
     assert np.abs(left).max() < 1e-9
 
@@ -314,9 +310,10 @@ def test_local_solves_ignore_and_exclude_rigid_motions() -> None:
 
 def test_an_unbalanced_load_has_no_certificate() -> None:
     problem = known("contact-patch/ratio=0.1")
-    own, s = replace(problem.own, f=-problem.own.f), problem.solution()
+    own, s = problem.own, problem.solution()
+    lifted = replace(own, exact=own.exact._replace(f=-own.exact.f))
     with pytest.raises(UncertifiableError, match="tensile"):
-        certify_over_ranks(own, s.x, problem.mechanics.multipliers(s))
+        certify_pair(lifted, s.x, problem.mechanics.multipliers(s))
 
 
 @pytest.mark.parametrize("size", [1e160, 1e300])
