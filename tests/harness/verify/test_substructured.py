@@ -34,8 +34,10 @@ from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.bound_search import BoundSearch
 from tests.support.decomposed_bodies import labelled, parts_by
 from tests.support.disturbed import DISTURBANCES
+from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
 
 pytestmark = pytest.mark.together
 CASES = (
@@ -326,3 +328,69 @@ def test_answers_that_overflow_have_no_bound_below_one(size: float) -> None:
         except UncertifiableError:
             continue
         assert found.bound >= 1
+
+
+SEARCHED = (
+    "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual", "membranes/S=3/n=2/dual",
+    "contact-patch/ratio=0.1/feti=3/dual",
+    "contact-patch/ratio=0.1/friction=coulomb/mu=0.2/feti=3/dual",
+    "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual",
+    "greco/n=4/dim=3/depth=2/feti=2/dual",
+    "sliding disc", "disc under rollers", "tilted disc", "soft disc",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        (SEARCHED[1], 8), (SEARCHED[7], 8),
+        *(pytest.param(name, 60, marks=pytest.mark.slow) for name in SEARCHED),
+    ],
+)  # fmt: skip
+def test_a_search_finds_no_answer_whose_error_exceeds_its_bound(
+    name: str, count: int
+) -> None:
+    faults, sharp = BoundSearch(name).result(count)
+
+    assert faults == []
+    assert len(sharp) == count
+    assert np.median(sharp) < 2
+
+
+@pytest.mark.parametrize(
+    ("sign", "push", "reason"),
+    [
+        (1, 0.1, "nothing balances the load of body upper along x"),
+        (-1, 0.0, "only tensile contact forces"),
+    ],
+)
+def test_an_unbalanced_load_is_refused_as_for_undivided_bodies(
+    sign: int, push: float, reason: str
+) -> None:
+    parts = disc_in_parts(push=push)
+    load = parts.load
+    parts = replace(parts, load=lambda at: sign * load(at))
+    whole = disc_between_plates(push=push).mechanics
+    assert whole is not None
+    whole = replace(whole, primal=replace(whole.primal, q=sign * whole.primal.q))
+    u, z = 0 * whole.primal.q, 0 * whole.primal.h
+    reasons = []
+    for bodies in (whole, decomposed_mechanics(on_one_process(parts))()):
+        with pytest.raises(UncertifiableError, match=reason) as refusal:
+            certify_pair(bodies, u, z)
+        reasons.append(str(refusal.value))
+
+    assert reasons[0] == reasons[1]
+
+
+def test_eliminated_supports_are_certified_in_floating_subdomains() -> None:
+    """The undivided body has the u_λ that is the nearest to û."""
+    name = "plate/Sx=1/Sy=4/n=2/supports=eliminated/dual"
+    mechanics = parse(name, PROBLEMS).build(reference_solution).mechanics
+    assert mechanics is not None
+    point = reference_point(mechanics, reference_solution)
+    u, none = 1.01 * point.u.astype(np.float64), np.zeros(0)
+    s = Solution(status=Status.SOLVED, x=u, y=none, z=none, z_box=0 * u)
+    divided, undivided = (certify(m, s).bound for m in (mechanics, mechanics.whole))
+
+    assert 0.999 * undivided <= divided <= 2 * undivided < 1

@@ -13,12 +13,12 @@ from mortarbench.problems.duality.decomposed import decompose, longitudinal_shar
 from mortarbench.problems.duality.problem import ElasticBodies, Meshed
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
-from mortarbench.problems.feti.local_bodies import floating_bodies, local_bodies
 from mortarbench.problems.feti.subdomains import (
     Contact,
     LocalSubdomains,
     on_one_process,
 )
+from mortarbench.problems.feti.substructures import decomposed_mechanics
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.hexahedra import bricks
@@ -78,13 +78,13 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
 
 def test_a_floating_body_has_six_orthonormal_motions_without_energy():
     own = torn(box(), np.zeros(0, dtype=np.int64))
-    floating = local_bodies(own).floating
-    R = floating.motions.toarray()
+    bodies = decomposed_mechanics(own)()
+    R = bodies.kernel.toarray()
 
-    assert floating_bodies(own.problem)
     assert_allclose(R.T @ R, np.eye(6), atol=1e-14)
     assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
-    assert_allclose(floating.combinations, np.eye(6))
+    assert (bodies.rigid.toarray() == R).all()
+    assert bodies.names == ("box",)
 
 
 @pytest.mark.parametrize("parts", [6, 12])
@@ -118,13 +118,12 @@ def test_a_face_fixed_along_some_axes_allows_the_other_motions(axes):
     face = np.flatnonzero(mesh.points[:, 0] == 0)
     fixed = np.unique([dofs_of(face, 3, "xyz".index(axis)) for axis in axes])
     own = torn(mesh, fixed)
-    floating = local_bodies(own).floating
-    left = LEFT[axes]
+    bodies, left = decomposed_mechanics(own)(), LEFT[axes]
 
-    assert (not floating_bodies(own.problem)) == (left == 0)
-    assert floating.combinations.shape[1] == left
+    assert bodies.names == (("box",) if left else ())
+    assert bodies.kernel.shape[1] == left
     if left:
-        R = floating.motions @ floating.combinations
+        R = bodies.kernel.toarray()
         assert_allclose(R.T @ R, np.eye(left), atol=1e-14)
         assert abs(R[fixed]).max() <= 1e-15
         assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
