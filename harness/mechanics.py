@@ -469,7 +469,7 @@ class RigidMotions(NamedTuple):
         return np.asarray(v - self.all @ self.along(v)) if self.all.shape[1] else v
 
 
-def rigid_motions(exact: Exact, R: csr_array, K: csr_array | None) -> RigidMotions:
+def rigid_motions(exact: Exact, R: csr_array, K: Matrix | None) -> RigidMotions:
     """Split the span of R (n, r), orthonormal to double precision, by the rows of B.
 
     K : (n, n) stored stiffness matrix; None if it is not assembled
@@ -482,7 +482,8 @@ def rigid_motions(exact: Exact, R: csr_array, K: csr_array | None) -> RigidMotio
     if K is None:
         KR: Any = csr_array(constrained.shape, dtype=Real)
     else:
-        KR = cancelling(K, constrained.toarray()) if p else np.zeros(constrained.shape)
+        KR = np.zeros(constrained.shape, dtype=Real)
+        KR = cancelling(csr_array(K), constrained.toarray()) if p else KR
         KR[exact.fixed] = 0
     return RigidMotions(
         all=R,
@@ -717,9 +718,12 @@ class Mechanics:
     @cached_property
     def motions(self) -> RigidMotions:
         """Rigid motions that the supports allow, as constrained and free motions."""
-        return rigid_motions(
-            self.exact, csr_array(self.inverse.kernel), csr_array(self.primal.P)
-        )
+        return rigid_motions(self.exact, csr_array(self.inverse.kernel), self.primal.P)
+
+    @property
+    def stored(self) -> csr_array:
+        """The stiffness K (n, n)."""
+        return csr_array(self.primal.P)
 
     def without_rigid_motion(self, v: Extended) -> Extended:
         """Return v − RRᵀv (n,), where R is `kernel`."""

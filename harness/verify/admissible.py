@@ -243,7 +243,15 @@ def _compliance(
 def balanced(
     bodies: Mechanics | DecomposedMechanics, multipliers: Extended, u: Extended
 ) -> Extended:
-    """Return λ̂ near `multipliers` in equilibrium with the load; see `Balance.near`.
+    """Return the λ̂ ∈ Λ nearest to `multipliers` in equilibrium with the load.
+
+    The equations Rᵀ(f − Bᵀλ̂ − Ku) = 0 hold for the rigid motions R that change gaps or
+    tangential displacements. λ̂ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the
+    relative distance of λᵢ from the boundary of Λ (for contact, wᵢ is proportional to
+    λᵢ), since corrections at open gaps or slipping nodes would do work. Along motions
+    that λ does not support (`supported_and_floating`), the load must vanish up to
+    rounding. If this attempt fails, all rows are corrected in two further attempts, the
+    last with equal weights.
 
     Raises
     ------
@@ -264,14 +272,28 @@ def balanced(
         if (np.abs(along) > rounding).any():
             pushed = bodies.rigid.T @ (free @ along)
             raise UncertifiableError(_unbalanced(pushed, bodies.names))
-    return Balance(
+    if not motions.G.shape[1]:
+        return multipliers
+    equations = _Equilibrium(
         motions.G,
         np.asarray((abs(exact.B) @ motions.largest).toarray()),
         motions.constrained.T @ f,
         motions.largest.T @ size,
         motions.KR.T @ u,
-        exact.forces,
-    ).near(multipliers)
+    )
+    w = relative(exact.forces.interior(multipliers))
+    for weights in (w, w + 1e-6, np.ones_like(w)):
+        lam = _balanced(exact.forces, equations, multipliers, weights)
+        if lam is not None:
+            return lam
+    raise UncertifiableError(
+        "only tensile contact forces could balance the load, which moves some body "
+        "away from its contacts, and no support holds the body"
+        if exact.contact.all()
+        else "only tensile contact forces or friction above its bound could "
+        "balance the load, which moves some body away from its contacts or along "
+        "them, and no support holds the body"
+    )
 
 
 def _unbalanced(pushed: Extended, names: tuple[str, ...]) -> str:
@@ -312,82 +334,49 @@ def supported_and_floating(
     return turn[:h].T, turn[h:].T
 
 
-class Balance(NamedTuple):
-    """Equilibrium equations Gᵀλ = load − bent, with the magnitudes of their terms.
-
-    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps
-    or tangential displacements.
-    """
+class _Equilibrium(NamedTuple):
+    """Equations Gᵀλ = load − bent, with the magnitudes of their terms."""
 
     G: Extended  #: (m, p)  BR
     G_terms: Extended  #: (m, p) sums of the absolute terms of G
     load: Extended  #: (p,)  Rᵀf
     load_terms: Extended  #: (p,) sums of the absolute terms of `load`
     bent: Extended  #: (p,) (KR)ᵀu, nonzero only because of rounding
-    forces: AdmissibleForces  #: set Λ of admissible multipliers
 
-    def near(self, multipliers: Extended) -> Extended:
-        """Return the λ̂ nearest to `multipliers` that satisfies the equations.
-
-        λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the relative distance of λᵢ
-        from the boundary of Λ (for contact, wᵢ is proportional to λᵢ), since
-        corrections at open gaps or slipping nodes would do work. Along motions that λ
-        does not support (`supported_and_floating`), the load must vanish up to
-        rounding. If this attempt fails, all rows are corrected in two further attempts,
-        the last with equal weights.
-
-        Raises
-        ------
-        UncertifiableError
-            If only tensile contact forces, or friction above its bound, could balance
-            the load.
-
-        """
-        if not self.G.shape[1]:
-            return multipliers
-        w = relative(self.forces.interior(multipliers))
-        for shares in (w, w + 1e-6, np.ones_like(w)):
-            if (balanced := self._solved(multipliers, shares)) is not None:
-                return balanced
-        raise UncertifiableError(
-            "only tensile contact forces could balance the load, which moves some body "
-            "away from its contacts, and no support holds the body"
-            if self.forces.contact.all()
-            else "only tensile contact forces or friction above its bound could "
-            "balance the load, which moves some body away from its contacts or along "
-            "them, and no support holds the body"
-        )
-
-    def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
-        """Solve by correcting only the rows with w > 0; return None on failure.
-
-        λ̂ is the projection of λ + WGν onto Λ, with W = diag(w); ν minimises a convex
-        function with one variable per motion.
-        """
-        supported, floating = supported_and_floating(self.G, w)
-        basis = supported @ _whitening((np.sqrt(w)[:, None] * self.G) @ supported)
-        lam = _newton(
-            self.forces,
-            multipliers,
-            w,
-            self.G @ basis,
-            np.asarray(basis.T @ (self.load - self.bent), dtype=Real),
-            lambda lam: np.abs(basis).T @ self._terms(lam),
-        )
-        if lam is None:
-            return None
-        missing = np.abs(floating.T @ (self.load - self.G.T @ lam))
-        total = np.abs(floating).T @ self._terms(lam)
-        return lam if (missing <= LOAD_ROUNDING * total).all() else None
-
-    def _terms(self, lam: Extended) -> Extended:
+    def terms(self, lam: Extended) -> Extended:
+        """Return the sums (p,) of the absolute terms of each equation."""
         return np.asarray(self.load_terms + self.G_terms.T @ np.abs(lam))
 
 
-def _whitening(M: Extended) -> NDArray[np.float64]:
-    """Return X (h, h) such that MX has orthonormal columns; M has full column rank."""
-    _, sizes, turn = np.linalg.svd(M.astype(np.float64), full_matrices=False)
-    return np.asarray(turn.T / sizes)
+def _balanced(
+    forces: AdmissibleForces,
+    equations: _Equilibrium,
+    multipliers: Extended,
+    w: Extended,
+) -> Extended | None:
+    """Solve the equations by correcting only rows with w > 0; return None on failure.
+
+    λ̂ is the projection of λ + WGν onto Λ, with W = diag(w); ν minimises a convex
+    function with one variable per motion.
+    """
+    G, load = equations.G, equations.load
+    supported, floating = supported_and_floating(G, w)
+    weighted = ((np.sqrt(w)[:, None] * G) @ supported).astype(np.float64)
+    _, sizes, turn = np.linalg.svd(weighted, full_matrices=False)
+    basis = supported @ (turn.T / sizes)  # such that GᵀWG = I in this basis
+    lam = _newton(
+        forces,
+        multipliers,
+        w,
+        G @ basis,
+        np.asarray(basis.T @ (load - equations.bent), dtype=Real),
+        lambda lam: np.abs(basis).T @ equations.terms(lam),
+    )
+    if lam is None:
+        return None
+    missing = np.abs(floating.T @ (load - G.T @ lam))
+    total = np.abs(floating).T @ equations.terms(lam)
+    return lam if (missing <= LOAD_ROUNDING * total).all() else None
 
 
 def _newton(
@@ -401,7 +390,7 @@ def _newton(
     """Solve the equilibrium equations, scaled to GᵀWG = I; return None on failure.
 
     Damped Newton's method is applied to the dual function of the minimisation in
-    `Balance.near`. Rows with w = 0 keep their multipliers.
+    `balanced`. Rows with w = 0 keep their multipliers.
     """
     on = w > 0
 

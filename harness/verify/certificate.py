@@ -60,7 +60,7 @@ x*‖²_P ≤ rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -167,7 +167,7 @@ class Certificate:
         If the solution is not proven to be nonzero, the bound is infinite, or 0 if
         `error` is 0.
         """
-        return self._relative(self.error)
+        return _ratio(self.error, self.least)
 
     @property
     def error(self) -> float:
@@ -185,13 +185,8 @@ class Certificate:
             "moved": self.moved,
             "friction": _root(2 * self.sliding),
         }
-        relative = {name: self._relative(value) for name, value in lengths.items()}
+        relative = {name: _ratio(v, self.least) for name, v in lengths.items()}
         return relative | {"seminorm": float(self.seminorm)}
-
-    def _relative(self, length: float) -> float:
-        if not length:
-            return 0.0
-        return length / self.least if self.least > 0 else np.inf
 
 
 class EigenvalueCertificate(NamedTuple):
@@ -211,27 +206,27 @@ class EigenvalueCertificate(NamedTuple):
     @property
     def bound(self) -> float:
         """Bound relative to ‖x*‖_P; infinite if x* is not proven to be nonzero."""
-        return self._relative(self.error)
+        return _ratio(self.error, self.norm - self.distance)
 
     @property
     def parts(self) -> dict[str, float]:
         """Relative components of the bound; see `harness.verify.verdicts.certified`."""
+        least = self.norm - self.distance
         return {
-            "distance": self._relative(self.distance),
+            "distance": _ratio(self.distance, least),
             "answer": self.bound,
-            "moved": self._relative(self.moved),
+            "moved": _ratio(self.moved, least),
         }
 
-    def _relative(self, length: float) -> float:
-        least = self.norm - self.distance
-        if not length:
-            return 0.0
-        return length / least if least > 0 else np.inf
+
+def _ratio(length: float, least: float) -> float:
+    """Return length/least; 0 if `length` is 0, inf if `least` is not positive."""
+    if not length:
+        return 0.0
+    return length / least if least > 0 else np.inf
 
 
-@np.errstate(
-    all="ignore"
-)  # a point may contain 1e300; an overflow raises UncertifiableError
+@np.errstate(all="ignore")  # a point may contain 1e300, and its energy may overflow
 def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertificate:
     """Bound the error of x over convex sets by (5), from an eigenvalue of P.
 
@@ -292,9 +287,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     return certify_pair(bodies, s.x, mechanics.multipliers(s))
 
 
-@np.errstate(
-    all="ignore"
-)  # a point may contain 1e300; an overflow raises UncertifiableError
+@np.errstate(all="ignore")  # a point may contain 1e300, and its energy may overflow
 def certify_pair(
     bodies: Mechanics | DecomposedMechanics, claimed: Vector, multipliers: Vector
 ) -> Certificate:
@@ -324,66 +317,14 @@ def certify_pair(
     if not (np.isfinite(claimed).all() and np.isfinite(multipliers).all()):
         raise UncertifiableError("the answer contains NaN or inf")
     split = Undivided(bodies) if isinstance(bodies, Mechanics) else Subdomains(bodies)
-    best = sharpest(
-        _certificates(split, claimed, multipliers), lambda: _at_rest(split, claimed)
-    )
-    if not isinstance(split, Undivided):
-        return best
-    best = including_lift(split.bodies, best)
-    if best.least >= best.error or split.bodies.lift.any():
+    outcomes = list(_certificates(split, claimed, multipliers))
+    certificates = [c for c in outcomes if isinstance(c, Certificate)]
+    if not certificates:
+        raise UncertifiableError(f"no admissible pair near the answer: {outcomes[0]}")
+    best = min(certificates, key=lambda c: c.error)
+    if isinstance(split, Subdomains) or split.bodies.lift.any() or best.bound <= 1:
         return best
     return replace(best, least=max(best.least, _least_norm(split)))
-
-
-def including_lift(mechanics: Mechanics, certificate: Certificate) -> Certificate:
-    """Make a certificate relative to the whole displacement u* instead of u* − w.
-
-    With the displacements of the certificate, ‖u*‖ ≥ ‖û + w‖ − ‖û − (u* − w)‖.
-    """
-    if not mechanics.lift.any():
-        return certificate
-    total = mechanics.norm(certificate.u + mechanics.lift)
-    return replace(certificate, least=total - certificate.error, norm=total)
-
-
-def sharpest(
-    tried: Iterator[Certificate | str], at_rest: Callable[[], Certificate | str]
-) -> Certificate:
-    """Return the certificate with the smallest `error`.
-
-    Parameters
-    ----------
-    tried : certificates of pairs near the answer, or reasons why pairs have none
-    at_rest : returns the certificate of the pair near zero, or the reason why it has
-        none; called if no other pair proves a bound
-
-    Raises
-    ------
-    UncertifiableError
-        If no pair proves a bound; the message contains the first reason.
-
-    """
-    outcomes = list(tried)
-    certificates = [c for c in outcomes if isinstance(c, Certificate)]
-    if certificates:
-        return min(certificates, key=lambda c: c.error)
-    last = at_rest()
-    if isinstance(last, Certificate):
-        return last
-    raise UncertifiableError(f"no admissible pair near the answer: {outcomes[0]}")
-
-
-def _least_norm(split: Undivided) -> float:
-    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer.
-
-    The bound is 0 if the pair is not admissible.
-    """
-    mechanics = split.bodies
-    u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
-    try:
-        return proof(split, u, u, lam, active.closed).least
-    except UncertifiableError:
-        return 0.0
 
 
 def _certificates(
@@ -391,29 +332,24 @@ def _certificates(
 ) -> Iterator[Certificate | str]:
     """Yield certificates of pairs, or reasons for their absence, until one is sharp."""
     exact, u = split.exact, split.free(claimed.astype(Real))
-    lam = exact.forces.project(multipliers.astype(Real))
-    active = suggested(exact, u, lam)
-    complementary = active.at_bounds(lam), active.closed
-    pairs = complementary, (lam, np.zeros(lam.size, dtype=bool))
-    bound = np.inf
-    for pair in pairs:
-        outcome = _proved(split, claimed, u, *pair)
+    lam, bounds = exact.forces.project(multipliers.astype(Real)), list[float]()
+    active, none = suggested(exact, u, lam), np.zeros(lam.size, dtype=bool)
+    for forces, closed in (active.at_bounds(lam), active.closed), (lam, none):
+        outcome = _proved(split, claimed, u, forces, closed)
         yield outcome
         if is_sharp(outcome):
             return
         if isinstance(outcome, Certificate):
-            bound = min(bound, outcome.bound)
-    if not isinstance(split, Undivided) or not split.motions.all.shape[1]:
-        return
-    if SHARP_BOUND < bound <= MAX_EXCHANGE_BOUND:
+            bounds.append(outcome.bound)
+    if not bounds:
+        yield _proved(split, claimed, 0 * split.exact.f, 0 * lam, none)
+    elif (
+        isinstance(split, Undivided)
+        and split.motions.all.shape[1]
+        and SHARP_BOUND < min(bounds) <= MAX_EXCHANGE_BOUND
+    ):
         v, mu, active = exchanged(split.bodies, active, EXCHANGE_ROUNDS)
         yield _proved(split, claimed, v, mu, active.closed)
-
-
-def _at_rest(split: Split, claimed: Vector) -> Certificate | str:
-    """Return the certificate of the pair near zero, or the reason why it is missing."""
-    u, lam = np.zeros_like(split.exact.f), np.zeros_like(split.exact.c)
-    return _proved(split, claimed, u, lam, np.zeros(lam.size, dtype=bool))
 
 
 def _proved(split: Split, *pair: Any) -> Certificate | str:
@@ -422,6 +358,16 @@ def _proved(split: Split, *pair: Any) -> Certificate | str:
         return proof(split, *pair)
     except UncertifiableError as e:
         return str(e)
+
+
+def _least_norm(split: Undivided) -> float:
+    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer.
+
+    The bound is 0 if the pair is not admissible.
+    """
+    u, lam, active = exchanged(split.bodies, unconstrained_guess(split.bodies))
+    found = _proved(split, u, u, lam, active.closed)
+    return found.least if isinstance(found, Certificate) else 0.0
 
 
 def is_sharp(outcome: Certificate | str) -> bool:
@@ -505,7 +451,8 @@ def _evaluated(
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
     gamma = reach.within(2 * gap) + along(motions.along(claimed - u))
-    in_K = known.stored(from_middle + around, gamma, theta)
+    size = from_middle + around  # bound on ‖e'‖ in K_T
+    in_K = _root(size * size + known.work(size, gamma, theta))
     # the energy in K_T of bodies that move together with their supports is zero
     if off is not None:
         turned = float(gamma @ along(motions.along(off[0])))
@@ -513,7 +460,7 @@ def _evaluated(
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
     stretch = _root(1 + theta)
     # ‖M‖ − around ≥ ‖û‖ − √(2g) and ≥ ‖u_λ‖ − √(2g), up to the residual of the solve
-    least = _root(u_u - u_d + 0.25 * d_d) - around
+    least = (_root(u_u - u_d + 0.25 * d_d) - around) / stretch
     certificate = Certificate(
         u=u,
         multipliers=lam,
@@ -525,12 +472,16 @@ def _evaluated(
         rounding=rounding,
         claimed=in_K,
         stretch=stretch,
-        least=least / stretch,
+        least=least,
         moved=_root(moved_moved),
         seminorm=near.unbalanced.size > 0,
     )
     if not np.isfinite(certificate.error):
         raise UncertifiableError("the answer is too large: its energy overflows")
+    if isinstance(split, Undivided) and split.bodies.lift.any():
+        # errors are relative to u* + w, and ‖u* + w‖ ≥ ‖û + w‖ − ‖û − u*‖
+        whole = split.bodies.norm(u + split.bodies.lift)
+        return replace(certificate, least=whole - certificate.error, norm=whole)
     return certificate
 
 
@@ -619,11 +570,7 @@ def _reach(
             forces = np.zeros_like(lam)
             forces[up] = y[: up.sum()]
             forces[down] -= y[up.sum() :]
-            bound = (
-                opened @ y,
-                length(split, split.pulled(forces)),
-                (pressed * y).max(initial=0.0),
-            )
+            bound = opened @ y, length(split, split.pulled(forces)), (pressed * y).max()
             bounds[:, k] = np.maximum(bounds[:, k], bound)
     # each combination equals ±γₖ up to COMBINATION_RESIDUAL·‖γ‖, and ‖γ‖ is at most the
     # sum of the bounds on |γₖ|

@@ -33,11 +33,7 @@ from mortarbench.harness.verify.active_set_refinement import (
     unconstrained_guess,
 )
 from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
-from mortarbench.harness.verify.certificate import (
-    UncertifiableError,
-    including_lift,
-    proof,
-)
+from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
 #: a result computed from the cache is discarded if its error bound exceeds this value
@@ -125,9 +121,7 @@ def _stored(path: Path, exact: Exact) -> ActiveSet | None:
 def _solved(mechanics: Mechanics, guess: ActiveSet) -> ReferencePoint:
     u, lam, active = exchanged(mechanics, guess)
     try:
-        certificate = including_lift(
-            mechanics, proof(Undivided(mechanics), u, u, lam, active.closed)
-        )
+        certificate = proof(Undivided(mechanics), u, u, lam, active.closed)
     except UncertifiableError as e:
         raise UnsolvedError(
             f"the reference solve found no admissible pair: {e}"

@@ -41,7 +41,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
-from scipy.sparse import csc_array, csc_matrix, csr_array
+from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from mortarbench.harness.mechanics import (
@@ -97,10 +97,6 @@ class Rounding(NamedTuple):
         rigid = 2 * size * (gamma @ self.strain) + gamma @ self.curvature @ gamma
         return float(rigid + theta * size * size)
 
-    def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) from the arguments of `work`; ‖e'‖ is the norm in K_T."""
-        return float(np.sqrt(size * size + self.work(size, gamma, theta)))
-
 
 class Neighbour(NamedTuple):
     """Displacement u_λ in equilibrium, near û, represented by d = Tû − u_λ."""
@@ -125,11 +121,6 @@ class Split(ABC):
         self.bodies = bodies
         self.exact, self.motions = bodies.exact, bodies.motions
 
-    @property
-    @abstractmethod
-    def stored(self) -> csr_array | None:
-        """The assembled K (n, n), if it is stored."""
-
     @abstractmethod
     def spread(self, u: Extended) -> Extended:
         """Return the copies Tu (N,) of u (n,)."""
@@ -137,10 +128,6 @@ class Split(ABC):
     @abstractmethod
     def joined(self, b: Extended) -> Extended:
         """Return the sums Tᵀb (n,) over the copies of each component."""
-
-    @abstractmethod
-    def averaged(self, v: Extended) -> Extended:
-        """Return averages (n,) of the copies v (N,), which may be moved rigidly."""
 
     @abstractmethod
     def product(self, v: Extended) -> Extended:
@@ -154,13 +141,18 @@ class Split(ABC):
     def variances(self, u: Extended) -> Vector:
         """Return sums (n,) of the squared terms of Ku."""
 
-    @abstractmethod
+    def averaged(self, v: Extended) -> Extended:
+        """Return averages (n,) of the copies v (N,), which may be moved rigidly."""
+        return self.joined(v)
+
     def theta(self, deformed: Extended, square: float) -> float:
         """Estimate the relative difference of the energies in K and K_T.
 
         deformed : (n,) displacement without rigid motion
         square : its energy in K_T
         """
+        del deformed, square
+        return 0.0
 
     @abstractmethod
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
@@ -203,11 +195,11 @@ class Split(ABC):
         computed by `cancelling`, because the terms of Kw cancel if w moves bodies far
         together with their supports. If K is not stored, the result is a sample.
         """
-        if self.stored is None:
+        if (K := self.bodies.stored) is None:
             off = sample(self.variances(w), w, self.precision)
             return self.free(off), float(np.sqrt(w**2 @ off**2))
         v = self.spread(w)
-        Kw, Kv = cancelling(self.stored, w[:, None])[:, 0], self.product(v)
+        Kw, Kv = cancelling(K, w[:, None])[:, 0], self.product(v)
         return self.free(Kw - self.joined(Kv)), abs(float(w @ Kw - v @ Kv))
 
     def scattered(self, v: Extended) -> Extended:
@@ -265,11 +257,9 @@ def sample(variances: Vector, u: Extended, precision: Any) -> Extended:
     x = np.arange(1, u.size + 1, dtype=np.uint64)
     for shift, by in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(by)
-    sign = np.where(
-        x >> np.uint64(63), RANDOM_ULPS, -RANDOM_ULPS
-    ) + SMOOTH_ULPS * np.sign(u)
-    sizes = np.sqrt(np.maximum(variances, 0)).astype(Real)
-    return np.asarray(sign * (np.finfo(precision).eps * sizes))
+    units = np.where(x >> np.uint64(63), RANDOM_ULPS, -RANDOM_ULPS)
+    sizes = np.finfo(precision).eps * np.sqrt(np.maximum(variances, 0)).astype(Real)
+    return np.asarray((units + SMOOTH_ULPS * np.sign(u)) * sizes)
 
 
 class Undivided(Split):
@@ -278,11 +268,6 @@ class Undivided(Split):
     bodies: Mechanics
     precision = Real
 
-    @property
-    def stored(self) -> csr_array:
-        """The stiffness K (n, n)."""
-        return csr_array(self.bodies.primal.P)
-
     def spread(self, u: Extended) -> Extended:
         """Return u."""
         return u
@@ -290,10 +275,6 @@ class Undivided(Split):
     def joined(self, b: Extended) -> Extended:
         """Return b with zeros on fixed components."""
         return self.free(b.copy())
-
-    def averaged(self, v: Extended) -> Extended:
-        """Return v with zeros on fixed components."""
-        return self.joined(v)
 
     def product(self, v: Extended) -> Extended:
         """Apply PKP with P = I − RRᵀ."""
@@ -309,11 +290,6 @@ class Undivided(Split):
         """Return (K∘K)(v∘v) for v = u − RRᵀu, since KR is known."""
         K = csc_array(self.bodies.primal.P).power(2)
         return np.asarray(K @ self.motions.without(u).astype(np.float64) ** 2)
-
-    def theta(self, deformed: Extended, square: float) -> float:
-        """Return 0, since K_T and K define the same norm."""
-        del deformed, square
-        return 0.0
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
         """Return bounds on ER, which is KR up to the projection P."""
@@ -338,7 +314,7 @@ class Subdomains(Split):
         """Assemble the coarse problem."""
         super().__init__(bodies)
         parts, fixed = bodies.parts, self.exact.fixed
-        T, R, w = csr_array(parts.spread), parts.kernel, parts.weight
+        T, w = csr_array(parts.spread), parts.weight
         self._parts, self._T = parts, T
         squares = csr_array((T.data**2, T.indices, T.indptr), shape=T.shape)
         total = squares.T @ w
@@ -348,24 +324,34 @@ class Subdomains(Split):
         jointly = squares.T @ np.ones(w.size) > 1 + 1e-9
         jointly[fixed] = True
         rows = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
-        self._inverse = 1 / total
-        self._inverse[fixed] = 0
-        self._rows, self._w, self._T_rows = rows, w[rows], csr_array(T[rows])
-        self._WR = scaled_rows(csr_array(R[rows]), self._w)
-        self._TWR = csr_array(self._T_rows.T @ self._WR)
+        inverse = 1 / total
+        inverse[fixed] = 0
+        W = diags_array(w[rows])
+        WT = csr_array(W @ T[rows])
+        self._rows, self._R = rows, csr_array(parts.kernel[rows])
+        self._Z = csr_array(W - WT @ (diags_array(inverse) @ WT.T))
 
     @cached_property
     def _coarse(self) -> Callable[[Vector], Vector]:
-        """Generalised inverse of R_TᵀZR_T; the kernel contains motions of bodies."""
-        R, motions = self._parts.kernel, self.motions.all.astype(np.float64)
-        A = csr_array(R[self._rows]).T @ self._WR
-        A = A - self._TWR.T @ scaled_rows(self._TWR, self._inverse)
-        return _coarse_solve(csr_array(A), (R.T @ (self._T @ motions)).toarray())
+        """Generalised inverse of R_TᵀZR_T, which fixes motions of whole bodies."""
+        A = csc_matrix(self._R.T @ (self._Z @ self._R))
+        motions = self._T @ self.motions.all.astype(np.float64)
+        kernel = (self._parts.kernel.T @ motions).toarray()
+        pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
+        free = np.setdiff1d(np.arange(A.shape[0]), pins)
+        factor = splu(
+            A[free][:, free],
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
 
-    @property
-    def stored(self) -> csr_array | None:
-        """The assembled K (n, n), if it is stored."""
-        return self.bodies.stored
+        def solve(b: Vector) -> Vector:
+            x = np.zeros_like(b)
+            x[free] = factor.solve(b[free])
+            return x
+
+        return solve
 
     def spread(self, u: Extended) -> Extended:
         """Return Tu (N,)."""
@@ -385,8 +371,7 @@ class Subdomains(Split):
         which has the same matrix as the coarse problem for forces.
         """
         x = v[self._rows].astype(np.float64)
-        jumps = x - self._T_rows @ (self._inverse * (self._T_rows.T @ (self._w * x)))
-        alpha = self._coarse(self._WR.T @ jumps)
+        alpha = self._coarse(self._R.T @ (self._Z @ x))
         return self.joined(self._part * (v - self._parts.kernel @ alpha))
 
     def product(self, v: Extended) -> Extended:
@@ -398,9 +383,7 @@ class Subdomains(Split):
         R = self._parts.kernel
         b = self._part * (self._T @ rho.astype(np.float64))
         for _ in range(2):  # the second pass restores digits lost by cancellation
-            mu = self._coarse(R.T @ b)
-            jumps = self._T_rows @ (self._inverse * (self._TWR @ mu))
-            b[self._rows] -= self._WR @ mu - self._w * jumps
+            b[self._rows] -= self._Z @ (self._R @ self._coarse(R.T @ b))
         return self._parts.solve(b)
 
     def variances(self, u: Extended) -> Vector:
@@ -421,28 +404,3 @@ class Subdomains(Split):
             strain[k] = length(self, v)
             curvature[k] = np.abs(supported.T) @ self.scattered(v)
         return Rounding(strain, curvature)
-
-
-def scaled_rows(M: csr_array, scale: Vector) -> csr_array:
-    """Multiply row i of M (k, l) by scale[i]."""
-    data = M.data * np.repeat(scale, np.diff(M.indptr))
-    return csr_array((data, M.indices, M.indptr), shape=M.shape)
-
-
-def _coarse_solve(A: csr_array, kernel: Any) -> Callable[[Vector], Vector]:
-    """Return a generalised inverse of A with `kernel` (r, q), fixing q components."""
-    pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
-    free = np.setdiff1d(np.arange(A.shape[0]), pins)
-    factor = splu(
-        csc_matrix(A[free][:, free]),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-
-    def solve(b: Vector) -> Vector:
-        x = np.zeros_like(b)
-        x[free] = factor.solve(b[free])
-        return x
-
-    return solve
