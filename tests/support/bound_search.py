@@ -16,10 +16,8 @@ from mortarbench.harness.verify.admissible import UncertifiableError
 from mortarbench.harness.verify.certificate import certify_pair
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.feti.subdomains import on_one_process
-from mortarbench.problems.feti.substructures import decomposed_mechanics
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.decomposed_bodies import parts_of
+from tests.support.decomposed_bodies import mechanics_of, parts_of
 from tests.support.disturbed import DISTURBANCES
 from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
 
@@ -76,7 +74,7 @@ class BoundSearch:
         problem, build = problem_and_build(name)
         self.name, self.mechanics = name, build().mechanics.whole
         self.truth = reference_point(self.mechanics, reference_solution)
-        self.own = decomposed_mechanics(on_one_process(problem))()
+        self.own = mechanics_of(problem)
 
     def errors(self, found, claimed):
         """Return the errors of û, answer and pair, and True if û is admissible."""

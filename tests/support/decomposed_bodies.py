@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import QP, Friction
-from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.harness.distributed.comm import SERIAL, Lead
+from mortarbench.harness.mechanics import (
+    NO_FRICTION,
+    DecomposedMechanics,
+    contact_rows,
+)
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
@@ -18,13 +23,10 @@ from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
 from mortarbench.problems.duality.problem import elastic_bodies_of, qp_choice
 from mortarbench.problems.families.declared import ContactFamily
+from mortarbench.problems.feti.mechanics import torn_mechanics
+from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_subdomains
-from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
-from mortarbench.problems.feti.subdomains import (
-    Contact,
-    DecomposedProblem,
-    on_one_process,
-)
+from mortarbench.problems.feti.subdomains import Contact, DecomposedProblem, TornBodies
 from mortarbench.problems.models.beam_ring import bodies as spectrum_of_beam_ring
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
@@ -42,9 +44,15 @@ def decompose_by_labels(
     primal: QP,
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
-) -> DecomposedBodies:
+) -> Served:
     """Decompose bodies, their QP and its friction into subdomains."""
-    return on_one_process(parts_by(bodies, layout, primal, friction, rows)).decomposed
+    return Served(TornBodies(parts_by(bodies, layout, primal, friction, rows)))
+
+
+def mechanics_of(problem: DecomposedProblem) -> DecomposedMechanics:
+    """Return the data for certificates on one process, without an assembled K."""
+    served = Served(TornBodies(problem))
+    return torn_mechanics(served, Lead(SERIAL, served))()
 
 
 def parts_by(
@@ -82,7 +90,7 @@ def parts_of(name: str) -> DecomposedProblem:
 
 def decomposed_pair(
     rows: str = "orthonormal", most: int = 2
-) -> tuple[Bodies, Any, DecomposedBodies]:
+) -> tuple[Bodies, Any, Served]:
     """Return bodies of 32 × 4 and 36 × 6 cells, their QP, and the decomposed bodies."""
     geometry = (4, 3, 6, "strain")
     bodies = model(*geometry)

@@ -25,17 +25,13 @@ from mortarbench.harness.verify.references import ReferencePoint, reference_poin
 from mortarbench.harness.verify.substructured import Subdomains, neighbour
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
-from mortarbench.problems.feti.subdomains import on_one_process
-from mortarbench.problems.feti.substructures import (
-    LocalProblems,
-    decomposed_mechanics,
-)
+from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 from tests.support.bound_search import BoundSearch
-from tests.support.decomposed_bodies import labelled, parts_by
+from tests.support.decomposed_bodies import labelled, mechanics_of, parts_by
 from tests.support.disturbed import DISTURBANCES
 from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
 
@@ -115,8 +111,7 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     def never() -> Any:
         raise AssertionError("certificates of subdomains need no factor of the whole")
 
-    subdomains = on_one_process(parts_by(bodies, layout, whole.primal, whole.friction))
-    own = decomposed_mechanics(subdomains)()
+    own = mechanics_of(parts_by(bodies, layout, whole.primal, whole.friction))
     mechanics = replace(
         whole,
         factorise=never,
@@ -375,7 +370,7 @@ def test_an_unbalanced_load_is_refused_as_for_undivided_bodies(
     whole = replace(whole, primal=replace(whole.primal, q=sign * whole.primal.q))
     u, z = 0 * whole.primal.q, 0 * whole.primal.h
     reasons = []
-    for bodies in (whole, decomposed_mechanics(on_one_process(parts))()):
+    for bodies in (whole, mechanics_of(parts)):
         with pytest.raises(UncertifiableError, match=reason) as refusal:
             certify_pair(bodies, u, z)
         reasons.append(str(refusal.value))

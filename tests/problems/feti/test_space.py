@@ -13,14 +13,10 @@ from mortarbench.problems.duality.decomposed import decompose, longitudinal_shar
 from mortarbench.problems.duality.problem import ElasticBodies, Meshed
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
-from mortarbench.problems.feti.subdomains import (
-    Contact,
-    LocalSubdomains,
-    on_one_process,
-)
-from mortarbench.problems.feti.substructures import decomposed_mechanics
+from mortarbench.problems.feti.subdomains import Contact, TornBodies
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.decomposed_bodies import mechanics_of
 from tests.support.hexahedra import bricks
 
 STEEL = Material(E=2e11, nu=0.3)
@@ -37,7 +33,7 @@ def box() -> Mesh:
 
 def torn(
     mesh: Mesh, fixed: np.ndarray, parts: int = 4, glue: str = "orthonormal"
-) -> LocalSubdomains:
+) -> TornBodies:
     """Divide a body under gravity into subdomains by METIS."""
     down = dofs_of(np.arange(len(mesh.points)), 3, 2)
     forces = Forces(down, np.full(down.size, -1.0))
@@ -49,13 +45,13 @@ def torn(
     (stage,) = load_steps(1, 1, forces, fixed)
     none = Contact(csr_array((0, mesh.dofs)), np.zeros(0), np.zeros(0))
     layout = of.shape.layout(parts)
-    return on_one_process(decompose(of, layout, glue, stage, none))
+    return TornBodies(decompose(of, layout, glue, stage, none))
 
 
-def stored(own: LocalSubdomains) -> csr_array:
+def stored(own: TornBodies) -> csr_array:
     """Return the matrix TᵀK_T T."""
     T, domains = own.spread, own.domains
-    blocks = [domains.classes[k].K @ T[a:b] for k, a, b in zip(
+    blocks = [domains.template(k).K @ T[a:b] for k, a, b in zip(
         domains.class_of, domains.start[:-1], domains.start[1:], strict=True
     )]  # fmt: skip
     ends = zip(domains.start[:-1], domains.start[1:], blocks, strict=True)
@@ -67,8 +63,8 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
     own = torn(mesh, dofs_of(np.flatnonzero(mesh.points[:, 2] == 0), 3))
     whole = stiffness(mesh, elasticity_matrix(STEEL, None) / STEEL.E)
 
-    assert own.number.size == 4
-    assert own.components.size == mesh.dofs
+    assert own.problem.layout.count == 4
+    assert own.spread.shape[1] == mesh.dofs
     assert_allclose(stored(own).toarray(), whole.toarray(), atol=1e-13)
     assert_allclose(own.spread.T @ own.f, np.tile([0.0, 0.0, -1.0], len(mesh.points)))
     free = np.setdiff1d(np.arange(mesh.dofs), own.problem.fixed)
@@ -78,7 +74,7 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
 
 def test_a_floating_body_has_six_orthonormal_motions_without_energy():
     own = torn(box(), np.zeros(0, dtype=np.int64))
-    bodies = decomposed_mechanics(own)()
+    bodies = mechanics_of(own.problem)
     R = bodies.kernel.toarray()
 
     assert_allclose(R.T @ R, np.eye(6), atol=1e-14)
@@ -118,7 +114,7 @@ def test_a_face_fixed_along_some_axes_allows_the_other_motions(axes):
     face = np.flatnonzero(mesh.points[:, 0] == 0)
     fixed = np.unique([dofs_of(face, 3, "xyz".index(axis)) for axis in axes])
     own = torn(mesh, fixed)
-    bodies, left = decomposed_mechanics(own)(), LEFT[axes]
+    bodies, left = mechanics_of(own.problem), LEFT[axes]
 
     assert bodies.names == (("box",) if left else ())
     assert bodies.kernel.shape[1] == left
