@@ -283,7 +283,8 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
 def test_local_problems_are_those_of_the_decomposed_bodies() -> None:
     parts = known(CASES[0]).own.parts
     assert isinstance(parts, LocalProblems)
-    K = block_diag([parts.torn.classes[k].K for k in parts.torn.class_of])
+    domains = parts.torn.domains
+    K = block_diag([domains.template(k).K for k in domains.class_of])
     rng = np.random.default_rng(6)
     v = rng.standard_normal(K.shape[0])
     b = v - parts.kernel @ (parts.kernel.T @ v)
