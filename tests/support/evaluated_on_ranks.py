@@ -5,10 +5,13 @@ See programs_on_ranks.py.
 
 from dataclasses import replace
 
+import numpy as np
 from mpi4py import MPI
 
+from mortarbench.harness import certify
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.certificate import UncertifiableError
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.verdicts import evaluated_by_ranks, plain
 from mortarbench.problems import PROBLEMS
@@ -34,8 +37,11 @@ def evaluated(name, ranks):
             solved[tol] = SMALBE().prepare(share.qp, tol)()
         s = replace(solved[tol], x=wrong * solved[tol].x)
         by_ranks = evaluated_by_ranks(emitted, s, ranks)
+        bounds = by_ranks["bounds"] or {}
+        same = ranks.comm.allgather(bounds.get("energy_bound"))
         told = {
-            "by_ranks": by_ranks, "digests": [digest, alone], "sizes": emitted.sizes,
+            "by_ranks": by_ranks, "same": len(set(same)) == 1,
+            "digests": [digest, alone], "sizes": emitted.sizes,
         }  # fmt: skip
         found.append((told, share.whole(s)))
     return found
@@ -47,7 +53,15 @@ def beside_one_process(name, found):
     for told, whole in found:
         one = {"objective": case.qp.objective(whole.x)}
         one |= kkt_residuals(case.qp, whole)._asdict()
-        by_one = {"values": one, "quantities": plain(case.quantities(whole))}
+        try:
+            certificate = certify(case.mechanics, case.mechanics.to_primal(whole))
+            bound, parts = certificate.bound, certificate.parts
+        except UncertifiableError:
+            bound, parts = np.nan, {}
+        by_one = {
+            "values": one, "bound": bound, "parts": parts,
+            "quantities": plain(case.quantities(whole)),
+        }  # fmt: skip
         yield told | {"by_one": by_one, "sizes": [told["sizes"], case.qp.sizes]}
 
 

@@ -33,7 +33,7 @@ forms = ["dual"]
 params = {{ Nr = 4, Nh = 3, steps = 1, feti = 4 }}
 """
 MEASURING = ("emission", "prepare", "solve")
-EVALUATING = ("residuals", "quantities")
+EVALUATING = ("residuals", "certificate", "quantities")
 #: time limit of each stage in s, sufficient for the stages before the planted failure
 LIMIT = 20
 KILLED = "rank 1 of 2 ranks ended: Killed"
@@ -96,6 +96,15 @@ def test_a_rank_that_hangs_while_it_emits_is_ended_at_the_time_limit(measured):
 
     assert record.verdict == "time_limit"
     assert record.message == "emission: killed after 2 s"
+
+
+def test_a_rank_that_cannot_certify_is_named_and_no_rank_certifies(measured):
+    record = measured("certificate", "raises-after")
+
+    assert record.verdict == "verified"
+    assert f"no energy_bound: RankFailedError: {RAISED}" in record.message
+    assert record.energy_bound is None
+    assert record.quantities["dofs"] == 848
 
 
 @pytest.mark.slow

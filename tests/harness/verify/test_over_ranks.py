@@ -1,4 +1,4 @@
-"""Residuals and quantities on several ranks, compared with one process."""
+"""Residuals and certificates on several ranks, compared with one process."""
 
 import json
 import os
@@ -6,6 +6,7 @@ import subprocess
 import sys
 from functools import cache
 
+import numpy as np
 import pytest
 
 from mortarbench.harness.distributed import mpi
@@ -34,6 +35,9 @@ REDUNDANT = "plate/Sx=3/Sy=3/n=2/pattern=column/jump=10/glue=redundant/dual"
 PATCH = "contact-patch/feti=3/dual"
 HERTZ = "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e6/dual"
 MINDLIN = "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual"
+#: relative difference of bounds: ranks use the sum over subdomains, one process the
+#: stored K
+ROUNDING = 1e-4
 
 
 #: cases that take several seconds on two ranks, or resemble a quick one
@@ -52,19 +56,35 @@ def marked(*cases):
     ]
 
 
+SHORT = (8, 2, ("membranes/S=3/n=2/dual", "disc under rollers"))
+#: modules that the default tests run on the same two ranks
+BY_DEFAULT = (("evaluated_on_ranks", *QUICK), ("fooled_on_ranks", SHORT[0], *SHORT[2]))
+
+
+def result(ranks, *program):
+    """Return the result of a module of `tests.support` on several ranks."""
+    same = ranks == 2 and program in BY_DEFAULT
+    programs = BY_DEFAULT if same else (program,)
+    return results(ranks, programs)[programs.index(program)]
+
+
 @cache
-def evaluated(ranks, cases):
-    """Return evaluations of the same answers on several ranks and in one process."""
-    programs = json.dumps([("evaluated_on_ranks", *cases)])
+def results(ranks, programs):
+    """Run programs on the same ranks; return their results."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
-            str(SUPPORT / "programs_on_ranks.py"), programs,
+            str(SUPPORT / "programs_on_ranks.py"), json.dumps(programs),
         ],
         cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)[0]
+    return json.loads(done.stdout)
+
+
+def evaluated(ranks, cases):
+    """Return evaluations of the same answers on several ranks and in one process."""
+    return result(ranks, "evaluated_on_ranks", *cases)
 
 
 @pytest.fixture(params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))])
@@ -95,6 +115,47 @@ def test_a_wrong_answer_is_refuted_by_ranks(found, case):
 
     assert max(wrong["primal"], wrong["dual"]) > 1e-4
     assert max(sound[-1]["primal"], sound[-1]["dual"]) < 1e-5
+
+
+@pytest.mark.parametrize("case", marked(*HELD))
+def test_certificates_by_ranks_are_those_of_one_process(found, case):
+    for answer in found(case):
+        bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
+
+        assert answer["same"]
+        # ranks bound the rounding of any assembled K, one process evaluates its own K
+        assert bounds["energy_bound"] == pytest.approx(
+            one["bound"], rel=ROUNDING, abs=1e-10
+        )
+        assert bounds["certificate"] == pytest.approx(
+            one["parts"], rel=ROUNDING, abs=1e-10
+        )
+
+
+@pytest.mark.parametrize("case", marked(HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN))
+def test_certificates_of_bodies_held_by_contact_are_those_of_one_process(found, case):
+    for answer in found(case):
+        bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
+
+        assert answer["same"]
+        # û is moved out of the other body by rounding errors, which affect terms below
+        # 1e-8
+        assert bounds["energy_bound"] == pytest.approx(
+            one["bound"], rel=ROUNDING, abs=1e-11
+        )
+        assert bounds["certificate"] == pytest.approx(
+            one["parts"], rel=ROUNDING, abs=1e-10
+        )
+
+
+def test_eliminated_supports_are_certified_in_floating_subdomains(found):
+    for answer in found(ELIMINATED):
+        # one process uses the undivided body, whose u_λ is the nearest to û
+        bound, least = answer["by_ranks"]["bounds"], answer["by_one"]["bound"]
+
+        assert answer["same"]
+        assert answer["by_ranks"]["notes"] == []
+        assert (1 - ROUNDING) * least <= bound["energy_bound"] <= 2 * least < 1
 
 
 @pytest.mark.parametrize(
@@ -151,6 +212,42 @@ def test_digests_depend_on_the_qp_and_not_on_the_number_of_ranks(ranks):
     assert all(by_ranks == by_one for by_ranks, by_one in digests)
     assert len({digest for digest, _ in digests}) == len(QUICK)
     assert all(digest.startswith(DISTRIBUTED_DIGEST) for digest, _ in digests)
+
+
+SEARCHED = (
+    HELD[0], "membranes/S=3/n=2/dual", "contact-patch/ratio=0.1/feti=3/dual",
+    "contact-patch/ratio=0.1/friction=coulomb/mu=0.2/feti=3/dual", MINDLIN, SPACE,
+    "sliding disc", "disc under rollers", "tilted disc", "soft disc",
+)  # fmt: skip
+
+
+def searched(count, ranks, names):
+    """Return faults that a search on several ranks finds, and reasons of refusals."""
+    return result(ranks, "fooled_on_ranks", count, *names)
+
+
+@pytest.mark.parametrize(
+    ("count", "ranks", "names"),
+    [
+        SHORT,
+        pytest.param(8, 4, SHORT[-1], marks=pytest.mark.slow),
+        *(pytest.param(60, n, SEARCHED, marks=pytest.mark.slow) for n in (2, 3)),
+    ],
+)
+def test_no_answer_is_found_whose_error_exceeds_the_bound_of_ranks(count, ranks, names):
+    for found in searched(count, ranks, names)["searches"].values():
+        assert found["faults"] == []
+        assert len(found["sharp"]) == count
+        assert np.median(found["sharp"]) < 2
+
+
+def test_an_unbalanced_load_is_refused_with_the_message_of_one_process():
+    pushed, lifted = searched(*SHORT)["refusals"]
+
+    assert pushed[0] == pushed[1]
+    assert lifted[0] == lifted[1]
+    assert "nothing balances the load of body upper along x" in pushed[0]
+    assert "only tensile contact forces" in lifted[0]
 
 
 def quantities_of_both(answer):

@@ -195,7 +195,7 @@ class SerialComm:
         return SimpleNamespace(Wait=lambda: None, Test=lambda: True)
 
 
-def on_one_rank(x=POINT.x, quantities=None):
+def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
     """Evaluate a point of `QP_` on one rank; the bound x₁ ≤ ¼ replaces the row of G."""
     ranks = Ranks(SerialComm())
 
@@ -211,7 +211,7 @@ def on_one_rank(x=POINT.x, quantities=None):
         )  # fmt: skip
         return Share(qp, lambda s: s)
 
-    answered = Evaluation(quantities)
+    answered = Evaluation(certifiable, quantities)
     emitted = DistributedQP(2, 1, 3, share, lambda: "", lambda s: answered)
     s = replace(POINT, x=slices(x), z=QP_.h[:0], z_box=slices([0.5, 0]))
     return evaluated_by_ranks(emitted, s, ranks)
@@ -247,3 +247,16 @@ def test_results_that_fail_on_ranks_are_empty_with_a_one_line_note():
 
     assert found["quantities"] == {}
     assert found["notes"] == ["no quantities: ZeroDivisionError: two lines"]
+
+
+def test_a_failing_bound_on_ranks_adds_a_note(monkeypatch):
+    def certify(*mechanics):
+        raise UncertifiableError("no admissible pair")
+
+    monkeypatch.setattr(
+        "mortarbench.harness.verify.verdicts.certify_over_ranks", certify
+    )
+    found = on_one_rank(certifiable=())
+
+    assert found["bounds"].keys() == {"certify_seconds"}
+    assert found["notes"] == ["no energy_bound: no admissible pair"]

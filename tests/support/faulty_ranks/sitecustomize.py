@@ -23,6 +23,7 @@ STAGES = {
     "prepare": ("mortarbench.solvers.smalbe.solver", "SMALBE.prepare"),
     "solve": ("mortarbench.solvers.smalbe.solver", "SMALBE.prepare"),
     "residuals": ("mortarbench.harness.verify.verdicts", "_values_by_ranks"),
+    "certificate": ("mortarbench.harness.verify.verdicts", "certify_over_ranks"),
     "quantities": ("mortarbench.problems.duality.decomposed", "_largest_von_mises"),
 }
 KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
