@@ -30,12 +30,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from mortarbench.harness.crossval.references import ReferencePoint
 from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
 from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.active_set_refinement import equilibrium
 from mortarbench.harness.verify.kkt import allowed
-from mortarbench.harness.verify.references import ReferencePoint
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,13 +40,13 @@ from mortarbench.harness.crossval.mesh_refinement import (
     NonNestedMeshError,
     prolongation,
 )
+from mortarbench.harness.crossval.references import UnsolvedError, reference_point
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.mechanics import Extended, Grid, Mechanics, Real
 from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Family, Reference
-from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
 #: name of the file with the estimates in the result folder
 FILE = "discretisation.json"

@@ -22,6 +22,11 @@ from mortarbench.harness.crossval.assessment import (
     assess,
     assess_point,
 )
+from mortarbench.harness.crossval.references import (
+    ReferencePoint,
+    UnsolvedError,
+    reference_point,
+)
 from mortarbench.harness.mechanics import Mechanics
 from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.qp import Matrix
@@ -30,11 +35,6 @@ from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.active_set_refinement import suggested
 from mortarbench.harness.verify.certificate import UncertifiableError, certify
 from mortarbench.harness.verify.kkt import Residuals, kkt_residuals
-from mortarbench.harness.verify.references import (
-    ReferencePoint,
-    UnsolvedError,
-    reference_point,
-)
 from mortarbench.harness.verify.verdicts import note_of
 
 #: Largest KKT residual of an answer that may replace a missing reference.

@@ -22,6 +22,7 @@ from mortarbench.harness.crossval.comparison import (
     compare_answers,
 )
 from mortarbench.harness.crossval.ground_truth import StoredAnswer
+from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import (
@@ -37,7 +38,6 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.stored_run import rebuild
 from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
 from mortarbench.harness.verify.infeasibility import certificate_of
-from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the file of the stored point was changed after the measurement"

@@ -86,7 +86,7 @@ class _Errors(NamedTuple):
     """Relative errors of one kind, such as the violations of the rows of A."""
 
     residual: str  #: name of the residual, a field of `Residuals`
-    place: str  #: name of the rows, bounds or conditions
+    reason: str  #: format of a sentence with the number and the ratio of an error
     ratios: Vector  #: (k,) errors divided by their sizes
     #: (k,) number of the row or variable of each error; None for 0, 1, …
     number: NDArray[np.int64] | None = None
@@ -268,25 +268,29 @@ def _errors(qp: QP, s: Solution) -> Iterator[_Errors]:
         return scale * error / np.maximum(scale * (terms + np.abs(rhs)), size)
 
     left, slack = np.abs(qp.A @ s.x - qp.b), qp.h - qp.G @ s.x
-    yield _Errors("primal", "row", violations(left, abs(qp.A) @ x, qp.b, by.E))
+    violated = "{} {{}} is violated by {{}} of its terms".format
+    ratios = violations(left, abs(qp.A) @ x, qp.b, by.E)
+    yield _Errors("primal", violated("row"), ratios)
     over = np.maximum(-slack, 0)
     ratios = violations(over, abs(qp.G) @ x, qp.h, by.F)
-    yield _Errors("primal", "inequality row", ratios)
+    yield _Errors("primal", violated("inequality row"), ratios)
     for c in every:
         over, scale = np.maximum(-c.slack, 0), 1 / by.D[c.variable]
         ratios = violations(over, c.terms, c.size, scale)
-        yield _Errors("primal", c.name, ratios, c.variable)
+        yield _Errors("primal", violated(c.name), ratios, c.variable)
 
     borne = admissible(qp.sets, s.z_box)
     r = Px + qp.q + qp.A.T @ s.y + qp.G.T @ np.maximum(s.z, 0) + borne
+    sign = "the sign of {}[{{}}] is wrong by {{}}".format
     for place, error in (
-        ("stationarity", np.abs(by.D * r)),
-        ("sign of z", np.maximum(-s.z, 0) / by.F),
-        ("sign of z_box", np.abs(by.D * (s.z_box - borne))),
+        ("component {} of Px + q + Aᵀy + Gᵀz + z_box is {}", np.abs(by.D * r)),
+        (sign("z"), np.maximum(-s.z, 0) / by.F),
+        (sign("z_box"), np.abs(by.D * (s.z_box - borne))),
     ):
         forces = np.maximum(error, FLOOR * sizes.force)
         near_zero = _over(forces, sizes.natural_force)
-        yield _Errors("dual", place, np.minimum(_over(error, sizes.force), near_zero))
+        ratios = np.minimum(_over(error, sizes.force), near_zero)
+        yield _Errors("dual", f"{place} of the largest force", ratios)
 
     work = qp.b @ s.y + qp.h @ s.z + sum(one.support(s.z_box) for one in qp.sets)
     energies = np.array([s.x @ Px, qp.q @ s.x, work])
@@ -295,11 +299,15 @@ def _errors(qp: QP, s: Solution) -> Iterator[_Errors]:
         near_zero = np.maximum(np.abs(error), _sup(energies)) / sizes.natural_energy
         return np.minimum(_over(np.abs(error), sizes.energy), near_zero)
 
-    yield _Errors("complementarity", "inequality row", relative(s.z * slack))
+    product = "multiplier times slack of {} {{}} is {{}} of the energy".format
+    ratios = relative(s.z * slack)
+    yield _Errors("complementarity", product("inequality row"), ratios)
     for one, of_set in zip(qp.sets, limits, strict=True):
         for c, gap in zip(of_set, one.support_gaps(s.x, s.z_box, of_set), strict=False):
-            yield _Errors("complementarity", c.name, relative(gap), c.variable)
-    yield _Errors("gap", "", relative(energies.sum(keepdims=True)))
+            ratios = relative(gap)
+            yield _Errors("complementarity", product(c.name), ratios, c.variable)
+    reason = "primal and dual objective differ by {1} of the energy"
+    yield _Errors("gap", reason, relative(energies.sum(keepdims=True)))
 
 
 @np.errstate(all="ignore")  # a point may contain NaN, inf, or 1e300
@@ -447,22 +455,7 @@ def diagnosis(qp: QP, s: Solution, tol: float) -> str:
     )
     at, ratio = int(one.ratios.argmax()), f"{one.ratios.max():.1e}"
     number = at if one.number is None else int(one.number[at])
-    match one.residual:
-        case "primal":
-            return f"{one.place} {number} is violated by {ratio} of its terms"
-        case "dual" if one.place == "stationarity":
-            return (
-                f"component {number} of Px + q + Aᵀy + Gᵀz + z_box is {ratio} of the "
-                "largest force"
-            )
-        case "dual":
-            return f"the {one.place}[{number}] is wrong by {ratio} of the largest force"
-        case "complementarity":
-            return (
-                f"multiplier times slack of {one.place} {number} is {ratio} of the "
-                "energy"
-            )
-    return f"primal and dual objective differ by {ratio} of the energy"
+    return one.reason.format(number, ratio)
 
 
 def _sup(v: Vector) -> float:

@@ -10,7 +10,6 @@ from copy import copy
 from dataclasses import replace
 from inspect import unwrap
 from itertools import count
-from numbers import Real
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -127,10 +126,10 @@ def measure(
                 answer, repeats = _repeated(run, qp, rest)
                 remembered = None if rest is None else rest.remembered(repeats)
                 untimed = run.solves - len(repeats)
-        except DeclinedError as e:
-            return _without_point(qp, Status.DECLINED, str(e))
-        except SolverError as e:
-            return _without_point(qp, Status.FAILED, str(e))
+        except (DeclinedError, SolverError) as e:
+            declined = isinstance(e, DeclinedError)
+            status = Status.DECLINED if declined else Status.FAILED
+            return Timed(Solution.without_point(qp, status, str(e)), Measurement())
         finally:
             ends()
     means = [sum(phase) / len(repeats) for phase in zip(*repeats, strict=True)]
@@ -231,7 +230,13 @@ class _Run:
         """Call `declines`, assemble P if the solver needs its entries, and prepare."""
         reason = reason_to_decline(self._solver, qp)
         if reason == NEEDS_MATRICES and not qp.is_explicit:
-            qp = _explicit(qp)
+            n = qp.q.size
+            if n > MAX_ASSEMBLED_ROWS or too_large(n, 3):
+                raise DeclinedError(
+                    f"{NEEDS_MATRICES}; P is an operator with {n} rows; operators are "
+                    f"assembled up to {MAX_ASSEMBLED_ROWS} rows, if memory allows"
+                )
+            qp = replace(qp, P=assembled(qp.P))
             reason = reason_to_decline(self._solver, qp)
         if reason is not None:
             raise DeclinedError(one_line(reason))
@@ -346,10 +351,6 @@ def _entries(M: Any) -> Any:
     return M.data if issparse(M) else M
 
 
-class ReasonError(SolverError):
-    """Error of a solver: `accepts` or the result of `declines` has the wrong type."""
-
-
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:
     """Return the reason why `solver` declines `qp`, or None if `solver` accepts it.
 
@@ -358,7 +359,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
 
     Raises
     ------
-    ReasonError
+    SolverError
         If `accepts` is not a tuple of classes, or if `declines` returns neither None
         nor a string (for instance False).
 
@@ -367,7 +368,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
     if not isinstance(accepted, tuple) or not all(
         isinstance(a, type) for a in accepted
     ):
-        raise ReasonError(
+        raise SolverError(
             f"accepts = {shown(accepted)}; expected a tuple of classes, such as (Box,)"
         )
     for one in qp.sets:
@@ -376,20 +377,8 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
     reason: object = solver.declines(qp)
     if reason is None or isinstance(reason, str):
         return reason
-    is_plain = isinstance(reason, bool | Real | np.generic)
-    got = shown(reason) if is_plain else type(reason).__name__
-    raise ReasonError(f"declines returned {got}; expected None or a string")
-
-
-def _explicit(qp: QP) -> QP:
-    """Return the QP with its operator P as a matrix; raise if P is too large."""
-    n = qp.q.size
-    if n > MAX_ASSEMBLED_ROWS or too_large(n, 3):
-        raise DeclinedError(
-            f"{NEEDS_MATRICES}; P is an operator with {n} rows; operators are "
-            f"assembled up to {MAX_ASSEMBLED_ROWS} rows, if memory allows"
-        )
-    return replace(qp, P=assembled(qp.P))
+    got = shown(reason) if isinstance(reason, int) else type(reason).__name__
+    raise SolverError(f"declines returned {got}; expected None or a string")
 
 
 def _fresh_copy(qp: QP) -> QP:
@@ -405,11 +394,8 @@ def _fresh_copy(qp: QP) -> QP:
             return M.view()
         if issparse(M) and hasattr(M, "indptr"):
             M = copy(M)
-            M.data, M.indices, M.indptr = (
-                M.data.view(),
-                M.indices.view(),
-                M.indptr.view(),
-            )
+            for name in ("data", "indices", "indptr"):
+                setattr(M, name, getattr(M, name).view())
         return M
 
     return _with_parts(qp, other)
@@ -441,17 +427,10 @@ def memory_mib(key: str, process: int | str = "self") -> float | None:
 def reset_peak() -> bool:
     """Reset VmHWM to the resident memory; return False on failure."""
     try:
-        Path("/proc/self/clear_refs").write_text(
-            "5"
-        )  # the code 5 resets VmHWM, see proc(5)
+        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see proc(5)
     except OSError:
         return False
     return True
-
-
-def _without_point(qp: QP, status: Status, message: str) -> Timed:
-    solution = Solution.without_point(qp, status, message)
-    return Timed(solution, Measurement())
 
 
 def one_line(message: object) -> str:
@@ -547,10 +526,7 @@ def _numbers(name: str, values: object) -> Vector:
 def _count(name: str, value: Any) -> int:
     count = int(value)
     if not 0 <= count <= MAX_COUNT:
-        got = (
-            count if abs(count) < 10 * MAX_COUNT else "a number far outside this range"
-        )
-        raise ValueError(f"{name} = {got}, expected 0 to 2**53")
+        raise ValueError(f"{name} = {shown(count)}, expected 0 to 2**53")
     return count
 
 

@@ -5,9 +5,9 @@ SCS (O'Donoghue, SIAM J. Optim. 31, 2021) use, in the variables √D x with D = 
 With the scale of forces F = max(‖Px/√D‖∞, ‖q/√D‖∞) and the sizes of the variables
 Xⱼ = max(‖√D x‖∞, tol·F)/√Dⱼ, a point solves a QP to the tolerance `tol` if
 
-* |aᵢx − bᵢ| ≤ tol·(|bᵢ| + Σ|aᵢⱼ|Xⱼ) for each equality row; likewise the violation of
-  each inequality row and bound, and of each disc and cone, relative to its limit and
-  the larger of its terms and X
+* |aᵢx − bᵢ| ≤ tol·(|bᵢ| + max(Σ|aᵢⱼxⱼ|, κᵢΣ|aᵢⱼ|Xⱼ)) for each equality row, where κᵢ is
+  1e-3 if bᵢ ≠ 0, and 0.1 if bᵢ = 0, as in the rule of verdicts; likewise the violation
+  of each inequality row and bound, and of each disc and cone
 * ‖r/√D‖∞ ≤ tol·F with r = Px + q + Aᵀy + Gᵀz + z_box
 * |xᵀPx + qᵀx + bᵀy + hᵀz + σ(z_box)| ≤ tol·max(|xᵀPx|, |qᵀx|, tol·F²), where σ is the
   support function of the sets, for bounds the product of bounds and multipliers
@@ -35,6 +35,10 @@ ROUNDING = 8
 #: diagonal entries of P below this factor times their mean count as zero, and so do
 #: forces (q/√D and Px/√D) below this factor times ‖√D x‖∞
 NEGLIGIBLE = 1e-12
+#: Least size of the terms of a row relative to those at X, if the right-hand side is
+#: not 0, and if it is. The judge has the same constants. It refuted answers of tests
+#: that measure rows relative to X, if the variables of a row are much smaller than X.
+OWN_FLOOR, FLOOR = 1e-3, 0.1
 
 
 def curvatures(qp: QP) -> Vector:
@@ -69,13 +73,15 @@ def relative_residual(qp: QP, s: Solution, tol: float) -> float:
     r, errors = Px + qp.q + z_box, []
     if y.size:
         r = r + qp.A.T @ y
-        errors.append(_ratio(qp.A @ x - qp.b, abs(qp.b) + abs(qp.A) @ X))
+        sizes = abs(qp.A) @ abs(x), abs(qp.A) @ X
+        errors.append(_relative(qp.A @ x - qp.b, qp.b, *sizes))
     if z.size:
         r = r + qp.G.T @ z
-        errors.append(_ratio(_over(qp.h - qp.G @ x), abs(qp.h) + abs(qp.G) @ X))
+        sizes = abs(qp.G) @ abs(x), abs(qp.G) @ X
+        errors.append(_relative(_over(qp.h - qp.G @ x), qp.h, *sizes))
     for limit in (limit for one in qp.sets for limit in one.limits(x)):
-        terms = np.maximum(limit.terms, X[limit.variable])
-        errors.append(_ratio(_over(limit.slack), limit.size + terms))
+        sizes = limit.terms, X[limit.variable]
+        errors.append(_relative(_over(limit.slack), limit.size, *sizes))
     energies, work = np.array([x @ Px, qp.q @ x]), qp.b @ y + qp.h @ z
     gap = energies.sum() + work + sum(one.support(z_box) for one in qp.sets)
     energy = max(_sup(energies), least * force) or force * size
@@ -93,6 +99,12 @@ def _diagonal(qp: QP) -> Vector:
     """Return max(Pⱼⱼ, 0) (n,), zero if P is an operator without a known diagonal."""
     d = qp.diagonal()
     return 0 * qp.q if d is None else np.maximum(d, 0)
+
+
+def _relative(error: Vector, rhs: Vector, terms: Vector, at_X: Vector) -> Any:
+    """Return the largest error of rows relative to their right-hand sides and terms."""
+    least = np.where(rhs != 0, OWN_FLOOR, FLOOR) * at_X
+    return _ratio(error, abs(rhs) + np.maximum(terms, least))
 
 
 def _over(slack: Vector) -> Vector:

@@ -58,12 +58,13 @@ def relative_residual(qp, s, double tol, Px, diagonal, G):
     cdef list owners = []
     cdef double[4] sums
     cdef double[3] most
-    cdef double worst
-    cdef Room room = Room(2 * n + 2 * m)
+    cdef double worst, least
+    cdef Room room = Room(2 * n + 3 * m)
     cdef double *w = room.at
     cdef double *r = w + n
     cdef double *missed = r + n
     cdef double *size = missed + m
+    cdef double *terms = size + m
     cdef const double *x = read(s.x, owners)
     cdef const double *y = read(s.y, owners)
     cdef const double *z = read(s.z_box, owners)
@@ -78,13 +79,14 @@ def relative_residual(qp, s, double tol, Px, diagonal, G):
         memcpy(w, read(diagonal, owners), n * sizeof(double))
     if not scales(w, n):
         tol = 0.0
-    # 1. Gᵀy, Gx and Σ|Gᵢⱼ|wⱼ
+    # 1. Gᵀy, Gx, Σ|Gᵢⱼ|wⱼ and Σ|Gᵢⱼxⱼ|
     if isinstance(G, np.ndarray):
         row = read(G, owners)
         for i in range(m):
             missed[i] = dot(row, x, n)
             for j in range(n):
                 size[i] += fabs(row[j]) * w[j]
+                terms[i] += fabs(row[j] * x[j])
             add(y[i], row, r, n)
             row += n
     else:
@@ -94,6 +96,7 @@ def relative_residual(qp, s, double tol, Px, diagonal, G):
                 k = by_components.indices[j]
                 missed[k] += by_components.data[j] * x[i]
                 size[k] += fabs(by_components.data[j]) * w[i]
+                terms[k] += fabs(by_components.data[j] * x[i])
                 r[i] += by_components.data[j] * y[k]
     # 2. Stationarity and the gap
     sums[:] = [0.0, 0.0, 0.0, 0.0]
@@ -108,5 +111,6 @@ def relative_residual(qp, s, double tol, Px, diagonal, G):
     worst = worst_ratio(sums, most, sums[0] + sums[1] + sums[3], tol)
     # 3. The rows
     for i in range(m):
-        worst = fmax(worst, ratio(missed[i] - e[i], fabs(e[i]) + most[2] * size[i]))
+        least = (1e-3 if e[i] else 0.1) * most[2] * size[i]
+        worst = fmax(worst, ratio(missed[i] - e[i], fabs(e[i]) + fmax(terms[i], least)))
     return worst

@@ -21,7 +21,7 @@ from mortarbench.harness.conformance.metamorphic import change_units, permute_un
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.verify.infeasibility import certificate_of
 from mortarbench.harness.verify.kkt import kkt_residuals
-from mortarbench.harness.verify.measure import ReasonError, reason_to_decline
+from mortarbench.harness.verify.measure import SolverError, reason_to_decline
 from tests.support.balls import Balls
 
 N = 8
@@ -472,7 +472,7 @@ def test_a_solver_without_a_declaration_accepts_only_bounds():
 @pytest.mark.parametrize("accepts", [Box, ["Box"], (Box, "Balls")])
 def test_a_declaration_other_than_a_tuple_of_classes_is_named(accepts):
     solver = type("Odd", (Careless,), {"accepts": accepts})()
-    with pytest.raises(ReasonError, match="expected a tuple of classes, such as"):
+    with pytest.raises(SolverError, match="expected a tuple of classes, such as"):
         reason_to_decline(solver, qp_with(BOX))
 
 

@@ -67,19 +67,21 @@ def free(n, **constraints):
 @pytest.mark.parametrize(
     ("qp", "x", "expected"),
     [
-        (free(2, A=[[1, 1]], b=[4]), [2, 2.008], 0.008 / (4 + 2 * 2.008)),
-        (free(2, G=[[3, 0]], h=[-1]), [1, 2], 4 / (1 + 3 * 2)),
+        (free(2, A=[[1, 1]], b=[4]), [2, 2.008], 0.008 / (4 + 4.008)),
+        (free(2, G=[[3, 0]], h=[-1]), [1, 2], 4 / (1 + 3)),
         (free(2, G=[[3, 0]], h=[4]), [1, 2], 0),
-        (free(2, lb=[1, 0]), [0.5, 4], 0.5 / (1 + 4)),
-        (free(2, ub=[1, 0]), [-4, 1], 1 / 4),
+        (free(2, lb=[1, 0]), [0.5, 4], 0.5 / (1 + 0.5)),
+        (free(2, ub=[1, 0]), [-4, 1], 1),
+        (free(2, ub=[1, 0]), [-4, 0.1], 0.1 / 0.4),  # relative to a tenth of ‖x‖∞
+        (free(2, A=[[1, 0]], b=[1]), [2, 1e6], 1 / (1 + 1e3)),
         (free(2, sets=[Discs([[0, 1]], [1])]), [0, 2], 1 / (1 + 2)),
         (free(2, sets=[Cones([[0, 1]], [0.5])]), [1, 2], 1.5 / (0.5 + 2)),
         (free(1, A=[[0]], b=[1]), [0], 1),
         # the distant limit of one row is not a scale of another
         (free(2, G=np.eye(2), h=[1e20, 1]), [1, 1.01], 0.01 / 2.01),
     ],
-    ids=["equality", "inequality", "slack", "lower", "upper", "disc", "cone",
-         "zero row", "distant row"],
+    ids=["equality", "inequality", "slack", "lower", "upper", "zero bound", "floor",
+         "disc", "cone", "zero row", "distant row"],
 )  # fmt: skip
 def test_a_violation_is_relative_to_its_row(qp, x, expected):
     s = at(x, 0 * qp.b, 0 * qp.h)
@@ -129,13 +131,13 @@ def test_energy_that_vanishes_beside_other_variables():
     assert residual(qp, at([1e-3, 6.002], [0])) > 0.1
 
 
-@pytest.mark.parametrize(("size", "expected"), [(1e-13, 1e-7), (1e-11, 1e-5)])
+@pytest.mark.parametrize(("size", "expected"), [(1e-13, 2e-6 / 3), (1e-11, 2e-4 / 3)])
 def test_a_solution_of_zero_is_reached_up_to_the_error_of_admissible_forces(
     size, expected
 ):
     """min ½|x|² − x₁ with 2x₁ + x₂ = 0, x ≥ 0: forces of 1 to 1e-6 move x by 1e-6.
 
-    The gap of a point (size, 0) is `size`, relative to 1e-6; its row violates 2·size.
+    The row of a point (size, 0) is violated by 2·size, relative to 0.1·3·1e-6.
     """
     qp = QP.from_arrays(np.eye(2), [-1, 0], A=[[2, 1]], b=[0], lb=0)
     assert residual(qp, at([0, 0], [0.5], z_box=[0, -0.5])) == 0

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from mortarbench.harness import Mechanics, Solution, Status
+from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.mechanics import Real
 from mortarbench.harness.sets.convex import hull
 from mortarbench.harness.verify.active_set_refinement import (
@@ -30,7 +31,6 @@ from mortarbench.harness.verify.active_set_refinement import (
     States,
 )
 from mortarbench.harness.verify.certificate import Certificate
-from mortarbench.harness.verify.references import reference_point
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.supported_by_contact import _eliminated, _loose, _substituted
 

@@ -14,13 +14,13 @@ from mortarbench.harness.crossval.assessment import assess, distances, energy_al
 from mortarbench.harness.crossval.comparison import brief, compare_answers
 from mortarbench.harness.crossval.discretisation import read_discretisation
 from mortarbench.harness.crossval.ground_truth import StoredAnswer, ground_truth_of
+from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.files.qpfile import qp_digest, save_qp
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.names import parse
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.registry import SolverSpec, load_plugin
 from mortarbench.harness.results.journal import Journal, read_journal
-from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import judged, new_record
 from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries

@@ -23,10 +23,10 @@ from mortarbench.harness.crossval.discretisation import (
     read_discretisation,
 )
 from mortarbench.harness.crossval.mesh_refinement import prolongation
+from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.mechanics import Grid
 from mortarbench.harness.names import assemble, completed, parse
 from mortarbench.harness.plugin import as_family
-from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.mesh import box
 from mortarbench.problems.models.hertz import insert_midpoints

@@ -19,12 +19,12 @@ from mortarbench.harness import (
     UncertifiableError,
     certify,
 )
+from mortarbench.harness.crossval.references import ReferencePoint, reference_point
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.processes import case_worker as generator
 from mortarbench.harness.verify.certificate import Certificate
-from mortarbench.harness.verify.references import ReferencePoint, reference_point
 from mortarbench.harness.verify.verdicts import certified, has_point
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS

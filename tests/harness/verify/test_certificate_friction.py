@@ -20,13 +20,13 @@ from mortarbench.harness import (
     Status,
     certify,
 )
+from mortarbench.harness.crossval.references import ReferencePoint, reference_point
 from mortarbench.harness.mechanics import AdmissibleForces, Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify import certificate
 from mortarbench.harness.verify.active_set_refinement import CLOSED, LOWER, UPPER
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.kkt import kkt_residuals
-from mortarbench.harness.verify.references import ReferencePoint, reference_point
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.solvers import SOLVERS

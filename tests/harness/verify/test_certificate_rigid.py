@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import Case, Solution, Status, UncertifiableError, certify
+from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.mechanics import (
     NO_FRICTION,
     AdmissibleForces,
@@ -28,7 +29,6 @@ from mortarbench.harness.verify.admissible import (
 )
 from mortarbench.harness.verify.certificate import Certificate, _charge, _Reach
 from mortarbench.harness.verify.kkt import kkt_residuals
-from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.substructured import Rounding, Undivided, length
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS

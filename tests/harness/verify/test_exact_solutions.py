@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import Case, certify
+from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.names import parse
-from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution

@@ -30,7 +30,7 @@ from tests.support.small_qps import at
 
 INF, TOL = np.inf, 1e-8
 #: numbers of random QPs
-SEARCHED = (60, pytest.param(300, marks=pytest.mark.slow))
+SEARCHED = (20, pytest.param(300, marks=pytest.mark.slow))
 
 
 def qp_of(A=None, b=(), G=None, h=(), lb=-INF, ub=INF, n=None):

@@ -15,7 +15,7 @@ from mortarbench.harness.verify.multipliers import with_multipliers
 
 TOL = 1e-8
 #: numbers of random QPs
-SEARCHED = (50, pytest.param(200, marks=pytest.mark.slow))
+SEARCHED = (20, pytest.param(200, marks=pytest.mark.slow))
 
 
 def solved_qp(seed, *, definite=True):
