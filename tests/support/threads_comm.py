@@ -24,8 +24,9 @@ import pytest
 from mortarbench.harness.distributed.comm import Comm, _MPIComm
 from mortarbench.problems.feti.operators import DualOperator
 from mortarbench.problems.feti.subdomain_classes import Subdomains
+from mortarbench.problems.feti.substructures import LocalProblems
 
-PATIENCE = 60.0  #: s; a busy machine may stop a thread for seconds
+PATIENCE = 20.0  #: s; a busy machine may stop a thread for seconds
 T = TypeVar("T")
 
 
@@ -138,5 +139,6 @@ def unlock(patch: pytest.MonkeyPatch) -> None:
         (DualOperator, "linear_map"),
         (DualOperator, "_blocks"),
         (DualOperator, "_diagonal"),
+        (LocalProblems, "weight"),
     ):
         patch.setattr(vars(owner)[name], "lock", nullcontext(), raising=False)

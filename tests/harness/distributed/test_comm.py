@@ -50,7 +50,9 @@ def test_one_process_is_a_communicator_of_one_rank():
     assert SERIAL.bcast(5) == 5
     assert SERIAL.together(lambda: 5) == 5
     numbers = Numbers(SERIAL, np.arange(3.0))
-    assert led(SERIAL, numbers, lambda: Lead(SERIAL, numbers)("total", 2.0, 1.0)[2]) == 5
+    assert (
+        led(SERIAL, numbers, lambda: Lead(SERIAL, numbers)("total", 2.0, 1.0)[2]) == 5
+    )
 
 
 def test_an_exception_on_one_rank_is_raised_on_all_ranks():
