@@ -208,13 +208,13 @@ class _Shape(tuple[Any, ...]):
 class Lead:
     """Calls of methods of an object that exists on all ranks, from rank 0.
 
-    served : the object on rank 0
+    served : the object on rank 0; None when the other ranks no longer have theirs
     name : name of the attribute, followed by a dot, of the objects with which the other
         ranks run `serve`; empty if they serve the objects themselves
     """
 
     def __init__(self, comm: Comm, served: Any, name: str = "") -> None:
-        self._comm, self._served, self._name = comm, served, name
+        self._comm, self.served, self._name = comm, served, name
 
     def __call__(self, method: str, *arguments: Any) -> Any:
         """Call a method on all ranks; return the result of rank 0.
@@ -222,9 +222,17 @@ class Lead:
         An exception on any rank is raised here, see `Comm.together`.
 
         method : name, with dots for methods of attributes
+
+        Raises
+        ------
+        RuntimeError
+            If the ranks have built another problem in the meantime.
+
         """
+        if self.served is None:
+            raise RuntimeError("the ranks keep only the QP that they built last")
         self._comm.order((f"{self._name}{method}", *arguments))
-        return self._comm.together(partial(_call, self._served, method, arguments))
+        return self._comm.together(partial(_call, self.served, method, arguments))
 
 
 def serve(comm: Comm, served: Any) -> None:
