@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,6 @@ from scipy.sparse import bsr_array, csr_array, diags_array, eye_array, vstack
 
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.subdomain_classes import DecomposedBodies, SubdomainClass
 from mortarbench.problems.feti.subdomains import GLUE, Weights
 from mortarbench.problems.feti.tearing import SubdomainMesh, blocks, classify
 
@@ -104,9 +104,19 @@ def decompose(
     )  # fmt: skip
 
 
+class Glued(NamedTuple):
+    """A contact problem on the subdomains."""
+
+    spread: csr_array  #: T (N, n), which maps displacements to torn unknowns
+    B: csr_array  #: (m, N) rows of supports, gluing and contact
+    c: Vector  #: (m,) right-hand side
+    scale: Vector  #: (m_I,) scales of the contact rows
+    f: Vector  #: (N,) torn load
+    equalities: int  #: number of rows of supports and gluing
+
+
 def glue(
     decomposition: Decomposition,
-    classes: tuple[SubdomainClass, ...],
     *,
     load: Vector,
     supports: csr_array,
@@ -116,12 +126,11 @@ def glue(
     E: Vector,
     shape: Vector | float = 1.0,
     rows: str = "orthonormal",
-) -> DecomposedBodies:
+) -> Glued:
     """Return the contact problem of the undivided mesh on the subdomains.
 
     Parameters
     ----------
-    classes : subdomain classes of the parts of the decomposition
     load : (n,) load on the undivided mesh; the copies of a node share it equally
     supports, supported : (k, n) one unit entry per prescribed component, and (k,) its
         value
@@ -154,8 +163,8 @@ def glue(
     scale = np.sqrt(np.append((E_of * shape)[of_row], softest / norm**2))
     values = np.zeros(of_row.size)
     values[: reached.nnz] = np.repeat(supported, np.diff(reached.indptr))
-    return DecomposedBodies(
-        classes=classes, class_of=decomposition.class_of, spread=T,
+    return Glued(
+        spread=T,
         B=csr_array(diags_array(scale) @ vstack([B_E @ turn, B_I])),
         c=scale * np.append(values, c), scale=scale[of_row.size :],
         f=average @ load, equalities=of_row.size,

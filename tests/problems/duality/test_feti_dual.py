@@ -89,9 +89,10 @@ def test_the_objective_and_its_constant_are_the_energy(law):
 def test_bounds_of_friction_are_scaled_like_its_rows():
     primal, friction = posed(3e8)
     pair, new = dual_of(primal, friction, "orthonormal")
-    k = friction.bound.size
+    k, E = friction.bound.size, pair.torn.rows.equalities
+    scale = pair.torn.problem.contact_scale
 
-    assert (new.qp.lb[: pair.equalities] == -np.inf).all()
-    assert (new.qp.lb[pair.equalities : -k] == 0).all()
-    assert new.qp.ub[-k:] * pair.scale[-k:] == pytest.approx(friction.bound)
+    assert (new.qp.lb[:E] == -np.inf).all()
+    assert (new.qp.lb[E:-k] == 0).all()
+    assert new.qp.ub[-k:] * scale[-k:] == pytest.approx(friction.bound)
     assert (new.qp.lb[-k:] == -new.qp.ub[-k:]).all()

@@ -18,8 +18,9 @@ from mortarbench.problems.feti.operator_arrays import (
     dual_operator,
     dual_operator_from_arrays,
 )
-from mortarbench.problems.feti.operators import block_pseudoinverse
-from mortarbench.problems.feti.subdomains import on_one_process
+from mortarbench.problems.feti.operators import block_pseudoinverse, explicit_classes
+from mortarbench.problems.feti.served import Served
+from mortarbench.problems.feti.subdomains import TornBodies
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.membranes import Membranes
@@ -42,8 +43,8 @@ def beam_and_ring(rows="orthonormal"):
     return decompose_by_labels(bodies, labelled(bodies, label), primal, rows=rows)
 
 
-def membranes(rows="orthonormal"):
-    return on_one_process(Membranes(2, 4).in_subdomains(rows)).decomposed
+def membranes(rows="orthonormal", size=2, cells=4):
+    return Served(TornBodies(Membranes(size, cells).in_subdomains(rows)))
 
 
 @pytest.fixture(
@@ -57,13 +58,14 @@ def pair(request):
 
 
 def operator_of(pair):
-    return dual_operator(pair.B, pair.domains, pair.equalities)
+    return dual_operator(pair.operator)
 
 
 def dense(pair):
     """Return K, B and R of all subdomains as dense matrices."""
-    K = block_diag(*(pair.classes[k].K.toarray() for k in pair.class_of))
-    return K, pair.B.toarray(), pair.domains.kernel.toarray()
+    domains = pair.domains
+    K = block_diag(*(domains.template(k).K.toarray() for k in domains.class_of))
+    return K, pair.torn.rows.B.toarray(), domains.kernel().toarray()
 
 
 def test_the_kernel_is_orthonormal_and_has_no_energy(pair):
@@ -106,7 +108,7 @@ def test_an_implicit_block_gives_the_same_product(pair):
     implicit = dual_operator_from_arrays(
         {**arrays, "explicit": np.zeros_like(arrays["explicit"])}
     )
-    x = np.random.default_rng(3).standard_normal((pair.c.size, 2))
+    x = np.random.default_rng(3).standard_normal((pair.torn.rows.c.size, 2))
     Fx = dual_operator_from_arrays(arrays)(x)
 
     assert arrays["explicit"].all()
@@ -131,18 +133,18 @@ def test_the_diagonal_is_that_of_the_matrix(pair):
 
 def test_the_largest_blocks_are_implicit_if_memory_is_limited(monkeypatch):
     pair = beam_and_ring()
-    arrays = operator_of(pair).arrays
+    arrays, domains, B = operator_of(pair).arrays, pair.domains, pair.torn.rows.B
     sizes = [
         np.unique(np.concatenate([
-            pair.B[:, pair.start[s] : pair.start[s + 1]].indices
-            for s in np.flatnonzero(pair.class_of == k)
-        ])).size for k in range(len(pair.classes))
+            B[:, domains.start[s] : domains.start[s + 1]].indices
+            for s in np.flatnonzero(domains.class_of == k)
+        ])).size for k in range(domains.sizes.size)
     ]  # fmt: skip
     assert len(set(sizes)) > 1
     room = 16 * (np.square(sizes).sum() - 1) / 2**20
     monkeypatch.setattr("mortarbench.problems.feti.operators.MAX_EXPLICIT_MIB", room)
 
-    explicit = operator_of(pair).arrays["explicit"]
+    explicit = explicit_classes(B, domains)
 
     assert arrays["explicit"].all()
     assert (np.array(sizes)[~explicit] == max(sizes)).all()
@@ -152,11 +154,16 @@ def test_the_largest_blocks_are_implicit_if_memory_is_limited(monkeypatch):
 def test_blocks_stored_as_one_triangle_have_the_same_products():
     """Two membranes of one subdomain each form one class, or two classes; blocks of a
     class with one subdomain are stored as one triangle."""
-    pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).decomposed
-    (kind,) = pair.classes
-    other = replace(pair, classes=(kind, replace(kind)), class_of=np.array([0, 1]))
-    F, apart = operator_of(pair), operator_of(other)
-    x = np.random.default_rng(3).standard_normal((pair.c.size, 2))
+    pair = membranes(size=1)
+    F, of_both = operator_of(pair), pair.operator
+    (size,), kind = pair.domains.sizes, pair.domains.template(0)
+    two = replace(
+        pair.domains, template=[kind, replace(kind)].__getitem__,
+        sizes=np.array([size, size]), class_of=np.array([0, 1]),
+    )  # fmt: skip
+    explicit = explicit_classes(of_both.B, two)
+    apart = dual_operator(replace(of_both, domains=two, explicit=explicit))
+    x = np.random.default_rng(3).standard_normal((pair.torn.rows.c.size, 2))
 
     assert_allclose(apart @ x, F @ x, rtol=1e-11, atol=1e-13)
     for name in KINDS:
@@ -171,8 +178,10 @@ def definition(pair, kind, scaling):
     _, B, _ = dense(pair)
     touched = np.abs(B).sum(axis=0) > 0
     D, softness = [], []
-    for s, k in enumerate(pair.class_of):
-        own, part = pair.classes[k], touched[pair.start[s] : pair.start[s + 1]]
+    domains = pair.domains
+    for s, k in enumerate(domains.class_of):
+        within = slice(domains.start[s], domains.start[s + 1])
+        own, part = domains.template(k), touched[within]
         S = own.K.toarray().copy()
         edge = np.zeros(len(S), dtype=bool)
         edge[own.boundary] = True
@@ -182,10 +191,10 @@ def definition(pair, kind, scaling):
             S = S[edge][:, edge] - S[edge][:, ~edge] @ inner @ S[~edge][:, edge]
             part = part[edge]
         D.append(S[part][:, part])
-        stiffness = own.stiffness[touched[pair.start[s] : pair.start[s + 1]]]
+        stiffness = own.stiffness[touched[within]]
         softness.append(1 / stiffness if scaling == "stiffness" else 0 * stiffness + 1)
     B, W = B[:, touched], np.diag(np.concatenate(softness))
-    gram, E = B @ W @ B.T, pair.equalities
+    gram, E = B @ W @ B.T, pair.torn.rows.equalities
     gram[:E, E:] = gram[E:, :E] = 0  # drop couplings with contact
     B_D = np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ B @ W
     return B_D @ block_diag(*D) @ B_D.T
@@ -229,20 +238,20 @@ def test_small_blocks_are_pseudoinverted():
 def test_contact_rows_do_not_affect_the_weights_of_equality_rows(kind):
     """Contact touches supports at both feet of the ring."""
     pair = beam_and_ring()
-    E = pair.equalities
-    alone = dual_operator(pair.B[:E], pair.domains, E)
+    B, c, E = pair.torn.rows
+    alone = dual_operator(replace(pair.operator, B=B[:E]))
     whole = operator_of(pair).build().preconditioner(kind, "stiffness")
     equations = alone.build().preconditioner(kind, "stiffness")(np.eye(E))
 
-    assert (pair.B[E:] @ pair.B[:E].T).nnz
-    found = whole(np.eye(pair.c.size))[:E, :E]
+    assert (B[E:] @ B[:E].T).nnz
+    found = whole(np.eye(c.size))[:E, :E]
     assert_allclose(found, equations, atol=1e-12 * abs(equations).max())
 
 
 def test_preconditioners_reduce_the_condition_number():
     """The condition number is smallest with the Dirichlet preconditioner, and largest
     without a preconditioner."""
-    pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).decomposed
+    pair = membranes(cells=8)
     F = operator_of(pair)
     _, B, R = dense(pair)
     G = R.T @ B.T
@@ -273,9 +282,10 @@ def test_a_wrong_name_of_a_preconditioner_is_refused_with_the_right_ones():
 
 def test_a_written_operator_is_read_as_the_same(tmp_path):
     pair = beam_and_ring()
-    F, m = operator_of(pair), pair.c.size
+    F, c = operator_of(pair), pair.torn.rows.c
+    m = c.size
     qp = QP(
-        P=F, q=pair.c, A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
+        P=F, q=c, A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
         lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
     )  # fmt: skip
     digest = save_qp(tmp_path / "qp.npz", qp, serialised=True)
@@ -287,19 +297,14 @@ def test_a_written_operator_is_read_as_the_same(tmp_path):
 
 
 def test_equal_subdomains_share_one_stored_stiffness():
-    few, many = (
-        operator_of(
-            on_one_process(Membranes(S, 4).in_subdomains("orthonormal")).decomposed
-        ).arrays
-        for S in (1, 3)
-    )
+    few, many = (operator_of(membranes(size=S)).arrays for S in (1, 3))
     assert few["K_data"].size == many["K_data"].size
     assert many["kind"].size == 9 * few["kind"].size
 
 
 def test_a_class_without_kernel_has_its_inverse():
     """This is the case of eliminated supports, as in FETI-1."""
-    (kind,) = membranes().classes
+    kind = membranes().domains.template(0)
     n = kind.K.shape[0]
     K = csc_array(kind.K + eye_array(n))
     nothing = np.zeros(0, dtype=np.int64)

@@ -1,6 +1,5 @@
 """Extreme eigenvalues by the Lanczos method, for operators with known spectra."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,22 +10,20 @@ from scipy.linalg import null_space, orth
 from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Vector, no_rows
-from mortarbench.harness.distributed.vectors import DistributedColumns
+from mortarbench.harness.distributed.comm import SERIAL, Lead
 from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.decomposed import decompose
+from mortarbench.problems.duality.feti_dual import TornDual
 from mortarbench.problems.feti import spectrum as module
-from mortarbench.problems.feti.distributed import local_share
-from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.operator_arrays import dual_operator
-from mortarbench.problems.feti.operators import DualOperator
+from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
     projector,
     ritz_bounds,
-    spectra_over_ranks,
+    spectra,
     spectrum,
 )
-from mortarbench.problems.feti.subdomains import Contact, on_one_process
+from mortarbench.problems.feti.subdomains import Contact, DecomposedProblem, TornBodies
 from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.models.membranes import Membranes
 from tests.support.decomposed_bodies import (
@@ -34,7 +31,6 @@ from tests.support.decomposed_bodies import (
     labelled,
     parts_by,
 )
-from tests.support.threads import on_threads, without_lock
 
 
 def identity(x: Vector) -> Vector:
@@ -103,10 +99,10 @@ def test_each_error_is_relative_to_its_own_eigenvalue(
     assert Spectrum(1.0, 10.0, *errors, 7).within(0.01) is is_within
 
 
-def projector_of(dual: LocalDual) -> Callable[[Vector], Vector]:
-    """Return the projector onto ker G ∩ range B of a dual without contact."""
-    qp = dual.share().qp
-    return projector(qp.P, qp.A)
+def dual_of(problem: DecomposedProblem) -> tuple[QP, csr_array]:
+    """Return a dual on one process, and its rows B."""
+    served = Served(TornBodies(problem))
+    return TornDual(served, Lead(SERIAL, served)).qp, served.torn.rows.B
 
 
 @pytest.mark.parametrize("rows", ["orthonormal", "redundant"])
@@ -115,8 +111,9 @@ def test_the_projector_is_onto_the_kernel_of_g_in_the_range_of_b(rows: str) -> N
     label = of_beam_ring(4, 3, 6, "strain").shape.layout(2).label
     primal = replace(primal, G=no_rows(primal.q.size), h=np.zeros(0))
     parts = parts_by(bodies, labelled(bodies, label), primal, rows=rows)
-    dual = LocalDual(on_one_process(parts))
-    P, B, G = projector_of(dual), dual.subdomains.rows.B, dual.G
+    qp, B = dual_of(parts)
+    G = csr_array(qp.A)
+    P = projector(B, G)
     dense = B.toarray()
     x = np.sin(np.arange(B.shape[0]) ** 2)
     y = P(x)
@@ -137,8 +134,7 @@ def spectrum_of_beam_ring(layers: int, cells: int) -> Spectrum:
     layout = bodies.shape.layout(cells)
     contact = Contact(no_rows(2 * layout.nodes), np.zeros(0), np.zeros(0))
     parts = decompose(bodies, layout, "orthonormal", stage, contact)
-    qp = LocalDual(on_one_process(parts)).share().qp
-    (result,) = spectra_over_ranks(qp.P, qp.A, tol=1e-3)
+    (result,) = spectra(*dual_of(parts), tol=1e-3)
     return result
 
 
@@ -178,49 +174,36 @@ def test_the_condition_is_wrong_by_the_relative_errors_of_both_eigenvalues():
 def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
     parts = Membranes(2, 2).in_subdomains("redundant")
     empty = no_rows(parts.contact.rows.shape[1])
-    own = on_one_process(replace(parts, contact=Contact(empty, *np.zeros((2, 0)))))
-    dense = own.rows.B.toarray()
+    torn = TornBodies(replace(parts, contact=Contact(empty, *np.zeros((2, 0)))))
+    dense = torn.rows.B.toarray()
     x = np.random.default_rng(1).standard_normal(len(dense))
-    P = projector(
-        LocalDual(own).share().qp.P,
-        DistributedColumns(csr_array((0, len(x))), own.ranks),
-    )
+    P = projector(torn.rows.B, csr_array((0, len(x))))
     assert P(x) == pytest.approx(dense @ np.linalg.lstsq(dense, x, rcond=None)[0])
 
 
 @pytest.mark.parametrize(
     "floating", [True, pytest.param(False, marks=pytest.mark.slow)]
 )
-def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch):
+def test_eigenvalues_are_those_of_the_dense_operator(floating):
     """The space is ker G ∩ range B, or range B without a coarse problem."""
-    without_lock(monkeypatch, DualOperator, "_blocks")
-    pieces = on_one_process(Membranes(2, 2).in_subdomains("redundant")).decomposed
-    m = pieces.equalities
-    B = pieces.B[:m]
-    F = dual_operator(B, pieces.domains, m)
-    G = csr_array((B @ pieces.domains.kernel).T)
+    parts = Membranes(2, 2).in_subdomains("redundant")
+    empty = no_rows(parts.contact.rows.shape[1])
+    qp, B = dual_of(replace(parts, contact=Contact(empty, *np.zeros((2, 0)))))
     if not floating:
-        G = G[:0]
-    qp = QP(
-        P=F, q=np.zeros(m), A=G, b=np.zeros(G.shape[0]), G=no_rows(m), h=np.zeros(0),
-        lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
-    )  # fmt: skip
-    classes = (None, ("lumped", "stiffness"))
-
-    def work(ranks):
-        share = local_share(qp, F.build(), ranks)
-        return spectra_over_ranks(share.qp.P, share.qp.A, classes, tol=1e-9)
+        qp = replace(qp, A=no_rows(qp.q.size), b=np.zeros(0))
+    names = (None, ("lumped", "stiffness"))
+    found = spectra(qp, B, names, tol=1e-9)
 
     Q = orth(B.toarray())
-    Q = Q @ null_space(G.toarray() @ Q)
-    dense = Q.T @ F.build()(np.eye(m)) @ Q
-    M = Q.T @ F.build().preconditioner(*classes[1])(np.eye(m)) @ Q
+    Q = Q @ null_space(qp.A.toarray() @ Q)
+    F, unit = qp.P.build(), np.eye(qp.q.size)
+    dense = Q.T @ F(unit) @ Q
+    M = Q.T @ F.preconditioner(*names[1])(unit) @ Q
     known = [np.linalg.eigvalsh(dense), np.sort(np.linalg.eigvals(M @ dense).real)]
-    for found in on_threads(3, work):
-        for got, values in zip(found, known, strict=True):
-            assert got.smallest == pytest.approx(values[0], rel=1e-8)
-            assert got.largest == pytest.approx(values[-1], rel=1e-8)
-            assert got.within(1e-9)
+    for got, values in zip(found, known, strict=True):
+        assert got.smallest == pytest.approx(values[0], rel=1e-8)
+        assert got.largest == pytest.approx(values[-1], rel=1e-8)
+        assert got.within(1e-9)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

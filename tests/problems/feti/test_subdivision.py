@@ -10,7 +10,7 @@ from mortarbench.problems.feti.subdivision import (
     half_discs_in_blocks,
     mesh_in_subdomains,
 )
-from mortarbench.problems.feti.subdomains import subdomains_of
+from mortarbench.problems.feti.subdomains import subdomain_ranks
 from mortarbench.problems.feti.tearing import compact_blocks, label_blocks
 from tests.support.decomposed_bodies import parts_of
 from tests.support.glued import decompose, structured_bodies
@@ -177,7 +177,7 @@ def test_sizes_are_balanced_even_if_few_subdomains_have_most_of_the_work():
     """In a graded half disc, subdomains in the middle have long boundaries; most nodes
     are in the others."""
     problem = parts_of("hertz-plane/n=8/halvings=4/feti=16/dual")
-    of, rank = problem.layout, subdomains_of(problem, 2)
+    of, rank = problem.layout, subdomain_ranks(problem, 2)
 
     for held in (of.sizes, of.glued() ** 2):
         by_rank = np.bincount(rank, held)

@@ -12,12 +12,13 @@ from tests.support.decomposed_bodies import decomposed_pair
 @pytest.fixture(scope="module")
 def parts() -> LocalProblems:
     """Return the local problems of beam and ring of the benchmark in subdomains."""
-    return LocalProblems(decomposed_pair(most=8)[2])
+    return decomposed_pair(most=8)[2].parts
 
 
 def dense(parts: LocalProblems) -> np.ndarray:
-    torn = parts.torn
-    return np.asarray(block_diag(*(torn.classes[k].K.toarray() for k in torn.class_of)))
+    domains = parts.torn.domains
+    blocks = (domains.template(k).K.toarray() for k in domains.class_of)
+    return np.asarray(block_diag(*blocks))
 
 
 def test_a_solve_projects_out_rigid_motions(

@@ -16,7 +16,7 @@ from mortarbench.problems.feti.subdivision import mesh_in_subdomains
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
-    on_one_process,
+    TornBodies,
 )
 from mortarbench.problems.feti.tearing import (
     blocks,
@@ -183,20 +183,22 @@ def test_a_mirror_image_belongs_to_another_class() -> None:
 
 
 def test_rectangles_form_one_class_and_each_layer_of_the_ring_one_class() -> None:
-    _, _, pair = decomposed_pair()
-    assert len(pair.classes) == 1 + 3
-    assert pair.class_of.size == 16 * 2 + 18 * 3
+    domains = decomposed_pair()[2].domains
+    assert domains.sizes.size == 1 + 3
+    assert domains.class_of.size == 16 * 2 + 18 * 3
 
 
 def test_the_assembled_torn_stiffness_is_that_of_the_undecomposed_body() -> None:
     bodies, _, pair = decomposed_pair()
-    K = block_diag([pair.classes[k].K for k in pair.class_of])
-    assembled = pair.spread.T @ K @ pair.spread
+    T, domains = pair.torn.spread, pair.domains
+    K = block_diag([domains.template(k).K for k in domains.class_of])
+    assembled = T.T @ K @ T
     assert abs(assembled - bodies.K).max() < 1e-12 * abs(bodies.K).max()
 
 
 def test_motions_of_the_kernel_are_orthonormal_and_have_no_energy() -> None:
-    for kind in decomposed_pair()[2].classes:
+    domains = decomposed_pair()[2].domains
+    for kind in map(domains.template, range(domains.sizes.size)):
         assert_allclose(kind.R.T @ kind.R, np.eye(3), atol=1e-14)
         assert abs(kind.K @ kind.R).max() < 1e-13 * abs(kind.K).max()
 
@@ -204,67 +206,65 @@ def test_motions_of_the_kernel_are_orthonormal_and_have_no_energy() -> None:
 @pytest.mark.parametrize("rows", GLUING)
 def test_rows_vanish_exactly_on_continuous_supported_displacements(rows: str) -> None:
     bodies, primal, pair = decomposed_pair(rows)
+    (B, c, E), T = pair.torn.rows, pair.torn.spread
+    scale = pair.torn.problem.contact_scale
     u = np.sin(np.arange(bodies.mesh.dofs) ** 2)
     u[bodies.B_D.indices] = 0
-    held = pair.B @ (pair.spread @ u)
-    assert_allclose(held[: pair.equalities], 0, atol=1e-9)
-    assert_allclose(
-        held[pair.equalities :],
-        pair.scale * (primal.G @ u),
-        rtol=1e-10,
-    )
-    assert_allclose(pair.c[pair.equalities :], pair.scale * primal.h, rtol=1e-12)
+    held = B @ (T @ u)
+    assert_allclose(held[:E], 0, atol=1e-9)
+    assert_allclose(held[E:], scale * (primal.G @ u), rtol=1e-10)
+    assert_allclose(c[E:], scale * primal.h, rtol=1e-12)
     # nothing else is fixed: rank of B_E = torn unknowns − free components
-    B_E = (pair.B[: pair.equalities]).toarray()
-    rank = int((np.linalg.svd(B_E, compute_uv=False) > 1e-9).sum())
-    left = pair.B.shape[1] - rank
+    sizes = np.linalg.svd(B[:E].toarray(), compute_uv=False)
+    left = B.shape[1] - int((sizes > 1e-9).sum())
     assert left == bodies.mesh.dofs - primal.b.size
 
 
 @pytest.mark.parametrize("rows", GLUING)
 def test_the_load_is_that_of_the_whole(rows: str) -> None:
     _, primal, pair = decomposed_pair(rows)
-    assert_allclose(pair.spread.T @ pair.f, -primal.q, atol=1e-15)
+    torn = pair.torn
+    assert_allclose(torn.spread.T @ torn.f, -primal.q, atol=1e-15)
 
 
 def test_orthonormal_rows_are_orthonormal_and_of_full_rank() -> None:
-    _, _, pair = decomposed_pair()
-    E = pair.equalities
-    root_E = np.linalg.norm(pair.B.toarray(), axis=1)
-    B = np.diag(1 / root_E) @ pair.B.toarray()
+    rows, _, E = decomposed_pair()[2].torn.rows
+    root_E = np.linalg.norm(rows.toarray(), axis=1)
+    B = np.diag(1 / root_E) @ rows.toarray()
     assert_allclose(B[:E] @ B[:E].T, np.eye(E), atol=1e-14)
     assert_allclose(B[E:] @ B[:E].T, 0, atol=1e-14)
     assert_allclose(np.unique(root_E.round(6)), np.sqrt([400.0, 4000.0]).round(6))
 
 
 def test_a_class_has_its_boundary_and_material() -> None:
-    _, _, pair = decomposed_pair(most=4)
-    beam = pair.classes[0]  # 4 × 4 cells
+    domains = decomposed_pair(most=4)[2].domains
+    classes = [domains.template(k) for k in range(domains.sizes.size)]
+    beam = classes[0]  # 4 × 4 cells
     assert beam.boundary.size == 2 * 16
     assert_allclose(beam.stiffness, 4000.0)  # E l/F₀
-    assert np.unique(np.concatenate([k.stiffness for k in pair.classes])).size == 2
+    assert np.unique(np.concatenate([k.stiffness for k in classes])).size == 2
 
 
 @pytest.mark.parametrize("rows", GLUING)
 def test_rows_are_those_of_sparse_algebra_on_the_whole_body(rows: str) -> None:
     """Supports, gluing and contact have the same order and the same signs."""
-    bodies, primal, found = decomposed_pair(rows)
+    bodies, primal, pair = decomposed_pair(rows)
     label = structured_bodies([(32, 4), (36, 6)], 2)
     parts = decompose(bodies.mesh.points, bodies.mesh.cells, label, bodies.body)
-    D, E = bodies.elasticity * (bodies.length / bodies.force), bodies.moduli
     expected = glue(
-        parts, tuple(elastic_class(part, D, E) for part in parts.parts),
-        load=bodies.f, supports=csr_array(primal.A), supported=primal.b,
-        contact=csr_array(primal.G), c=primal.h, E=E[bodies.body_of_node], rows=rows,
+        parts, load=bodies.f, supports=csr_array(primal.A), supported=primal.b,
+        contact=csr_array(primal.G), c=primal.h, E=bodies.moduli[bodies.body_of_node],
+        rows=rows,
     )  # fmt: skip
-    largest = abs(expected.B).max()
+    torn, found = pair.torn, pair.torn.rows
 
     assert found.equalities == expected.equalities
-    assert abs(found.B - expected.B).max() <= 1e-14 * largest
-    assert abs(found.spread - expected.spread).max() <= 1e-14
-    for name in ("c", "f", "scale"):
-        assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-14)
-    assert np.array_equal(found.class_of, expected.class_of)
+    assert abs(found.B - expected.B).max() <= 1e-14 * abs(expected.B).max()
+    assert abs(torn.spread - expected.spread).max() <= 1e-14
+    assert_allclose(found.c, expected.c, rtol=1e-14)
+    assert_allclose(torn.f, expected.f, rtol=1e-14)
+    assert_allclose(torn.problem.contact_scale, expected.scale, rtol=1e-14)
+    assert np.array_equal(pair.domains.class_of, parts.class_of)
 
 
 def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
@@ -282,20 +282,21 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
             csr_array(eye_array(n, format="csr")[held[:1]]), np.ones(1), np.zeros(0)
         ),
     )  # fmt: skip
-    pair, found = (
-        on_one_process(one).decomposed
-        for one in (problem, replace(problem, eliminated=True))
+    whole, torn = (
+        TornBodies(one) for one in (problem, replace(problem, eliminated=True))
     )
-    first, second = (found.classes[k] for k in found.class_of)
+    first, second = map(torn.domains.template, torn.domains.class_of)
     assert [first.R.shape, second.R.shape] == [(15, 1), (18, 3)]
     assert abs(first.K @ first.R).max() < 1e-13
     assert_allclose(first.R.T @ first.R, [[1.0]])
     assert abs(first.R[first.fixing]).min() > 0.1
-    assert found.equalities == pair.equalities - held.size
-    assert found.B.shape[0] == found.c.size == found.equalities + 1  # the contact row
+    B, c, equalities = torn.rows
+    assert equalities == whole.rows.equalities - held.size
+    assert B.shape[0] == c.size == equalities + 1  # the contact row
     u = np.arange(n) ** 0.5
     u[held] = 0
-    assert_allclose(found.spread @ u, (pair.spread @ u)[pair.spread @ u != 0])
-    assert_allclose(found.B @ (found.spread @ u), 0, atol=1e-12)
+    v = whole.spread @ u
+    assert_allclose(torn.spread @ u, v[v != 0])
+    assert_allclose(B @ (torn.spread @ u), 0, atol=1e-12)
     free = ~np.isin(np.arange(n), held)
-    assert_allclose(found.spread.T @ found.f, free * load)
+    assert_allclose(torn.spread.T @ torn.f, free * load)
