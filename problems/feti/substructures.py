@@ -123,7 +123,7 @@ class LocalProblemsOnRanks:
     @cached_property
     def kernel(self) -> csr_array:
         """R (N, r), a basis of the rigid motions of all subdomains."""
-        kernel: csr_array = self.lead("domains.kernel")
+        kernel: csr_array = self.lead("parts.torn.domains.kernel")
         return kernel
 
     @cached_property

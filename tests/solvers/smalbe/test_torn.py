@@ -147,9 +147,9 @@ class InPython:
 def test_a_preconditioner_is_built_once():
     F = build("membranes/S=2/n=4/dual").qp.P.build()
 
-    built = F.preconditioner("dirichlet", "stiffness")
-    assert F.preconditioner("dirichlet", "stiffness") is built
-    assert F.preconditioner("lumped", "stiffness") is not built
+    built = F.preconditioner_parts("dirichlet", "stiffness")
+    assert F.preconditioner_parts("dirichlet", "stiffness") is built
+    assert F.preconditioner_parts("lumped", "stiffness") is not built
 
 
 def test_a_sequence_is_warm():

@@ -1,0 +1,255 @@
+"""Torn bodies on ranks in threads: rank 0 obtains the results of one process."""
+
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.sparse import csr_array, issparse
+
+from mortarbench.harness import InputError, Solution, Status
+from mortarbench.harness.distributed.comm import SERIAL, Lead, led
+from mortarbench.harness.mechanics import Real
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.feti.served import Served, operator_of, parts_of
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass
+from mortarbench.problems.feti.subdomains import Contact, TornBodies, subdomain_ranks
+from mortarbench.solvers.reference.operators import reference_of_operator
+from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.decomposed_bodies import parts_of as problem_of
+from tests.support.threads_comm import results_of, unlock
+
+pytestmark = pytest.mark.together
+
+PRECONDITIONERS = [
+    (kind, scaling)
+    for kind in ("lumped", "dirichlet")
+    for scaling in ("multiplicity", "stiffness")
+]
+#: names of cases, and numbers of ranks: redundant rows, friction in discs, later load
+#: steps with Coulomb's law, eliminated supports, contact at all inner nodes
+CASES = [
+    ("membranes/S=2/n=3/glue=redundant", 3),
+    ("contact-patch/lower=4/upper=3/friction=tresca/bound=1e5/feti=2/dim=3", 2),
+    ("beam-ring/Nr=1/Nh=1/steps=2/friction=coulomb/mu=0.3/feti=1", 3),
+    ("plate/Sx=2/Sy=2/n=2/supports=eliminated/pattern=column/jump=10", 2),
+    ("obstacle/n=6/feti=3", 2),
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ranks_do_not_lock_one_another_out():
+    with pytest.MonkeyPatch.context() as patch:
+        unlock(patch)
+        yield
+
+
+def built(name, comm):
+    """Build a case on ranks; return its objects on this rank, and the case."""
+    case = parse(f"{name}/dual", PROBLEMS)
+    build = case.family.on_ranks(case.form, case.params)
+    return build(comm, reference_of_operator)
+
+
+def facts(made, comm, s):
+    """Return results of a case on rank 0, for given vectors and the answer `s`."""
+    lead, torn = Lead(comm, made.served), made.served.torn
+    case, parts = made.case(lead), parts_of(made.served, lead)
+    qp, F = case.qp, case.qp.P.build()
+    rng = np.random.default_rng(5)
+    X, v = rng.standard_normal((qp.q.size, 2)), rng.standard_normal(torn.f.size)
+    w = rng.standard_normal(parts.spread.shape[0])
+    at = np.flatnonzero(parts.spread.T @ np.ones(w.size))[::3]
+    found = {
+        "operator": {"Fx": qp.P @ X[:, 0], "FX": qp.P @ X, "diagonal": F.diagonal()},
+        "preconditioner": {
+            f"{p}{k}": F.preconditioner(*p)(x)
+            for p in PRECONDITIONERS
+            for k, x in enumerate((X, X[:, 1]))
+        },
+        "inverse": {"K⁺": lead("domains.inverse", v)},
+        "parts": {
+            "product": parts.product(w),
+            "precise": parts.product(w.astype(Real)),
+            "squared_product": parts.squared_product(w),
+            "solve": parts.solve(w),
+            "weight": parts.weight,
+            "diagonal": parts.diagonal(at),
+            "kernel": parts.kernel,
+        },
+        "dual": {"q": qp.q, "G": qp.A, "b": qp.b},
+        "digest": case.digest,
+    }
+    if s is None:
+        s = reference_of_operator(qp)
+    quantities = dict(case.quantities(s))
+    lead("forget")  # factors are computed again
+    return found | {
+        "s": s,
+        "u": {"u": case.recover(s)},
+        "again": {"Fx": qp.P @ X[:, 0]},
+        "quantities": quantities,
+    }
+
+
+@cache
+def alone(name):
+    return facts(built(name, SERIAL), SERIAL, None)
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda p: p[0].partition("/")[0])
+def both(request):
+    """Return results of several ranks, and those of one process."""
+    (name, size), s = request.param, alone(request.param[0])["s"]
+
+    def work(comm):
+        made = built(name, comm)
+        return led(comm, made.served, lambda: facts(made, comm, s))
+
+    return results_of(size, work)[0], alone(name)
+
+
+def same(found, known, relative=1e-9, rounding=0.0):
+    assert found.keys() == known.keys()
+    for name, value in known.items():
+        got = found[name]
+        if isinstance(value, dict):
+            same(got, value, relative, rounding)
+        elif isinstance(value, str) or value is None:
+            assert got == value, name
+        else:
+            value, got = (
+                x.toarray() if issparse(x) else np.asarray(x) for x in (value, got)
+            )
+            assert got.dtype == value.dtype, name
+            size = np.abs(value[np.isfinite(value)]).max(initial=0)
+            bound = relative * size + rounding
+            assert_allclose(got, value, rtol=0, atol=bound, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "what", ["operator", "preconditioner", "inverse", "parts", "dual", "u", "again"]
+)
+def test_results_of_ranks_are_those_of_one_process(both, what):
+    found, known = both
+    same(found[what], known[what])
+
+
+def test_quantities_are_those_of_one_process(both):
+    """They contain the largest stresses, forces, and condition numbers."""
+    found, known = both
+    same(found["quantities"], known["quantities"], 1e-6, 1e-13)
+
+
+def test_the_digest_is_that_of_one_process(both):
+    found, known = both
+    assert len(found["digest"]) == 16
+    assert found["digest"] == known["digest"]
+
+
+@pytest.mark.parametrize("name", [CASES[0][0], CASES[3][0]])
+def test_the_digest_is_that_of_the_case_without_ranks(name):
+    case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
+    assert case.digest == alone(name)["digest"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "beam-ring/steps=1/dual", "beam-ring/steps=1/feti=4/primal",
+        "beam-ring/kinematics=finite/steps=1/dual", "plate/primal", "hertz-plane/dual",
+        "obstacle/dim=1/feti=5/dual",
+    ],
+)  # fmt: skip
+def test_cases_without_subdomains_are_not_built_on_ranks(name):
+    case = parse(name, PROBLEMS)
+    assert case.family.on_ranks(case.form, case.params) is None
+    assert case.family.subdomains(case.form, case.params) == 1
+
+
+def used(problem, size, monkeypatch):
+    """Apply F on ranks.
+
+    Return the subdomains, the number of classes that each rank assembled, and the
+    number of classes of which a rank computed explicit blocks.
+    """
+    condensed, condense = [], SubdomainClass.condense
+
+    def noted(kind, b):
+        condensed.append(b)
+        return condense(kind, b)
+
+    def work(comm):
+        assembled = []
+
+        def assemble(part):
+            assembled.append(part)
+            return problem.assemble_class(part)
+
+        served = Served(TornBodies(replace(problem, assemble_class=assemble), comm))
+        F = operator_of(served, Lead(comm, served))
+        led(comm, served, lambda: F @ np.ones(F.shape[0]))
+        return served.domains, len(assembled)
+
+    monkeypatch.setattr(SubdomainClass, "condense", noted)
+    found = results_of(size, work)
+    return found[0][0], [n for _, n in found], len(condensed)
+
+
+@pytest.mark.parametrize("size", [2, 3])
+@pytest.mark.parametrize(
+    "name", ["membranes/S=2/n=3", "beam-ring/Nr=2/Nh=2/steps=1/feti=2"]
+)
+def test_ranks_assemble_classes_of_their_subdomains_and_share_blocks(
+    name, size, monkeypatch
+):
+    """A class that occurs on several ranks has its blocks computed once."""
+    domains, assembled, condensed = used(problem_of(f"{name}/dual"), size, monkeypatch)
+    own = [set(domains.class_of[domains.rank == r].tolist()) for r in range(size)]
+
+    assert assembled == list(map(len, own))
+    assert condensed == domains.sizes.size
+    assert sum(map(len, own)) > condensed  # some class occurs on several ranks
+
+
+def subdomains(sizes, glued):
+    """Return a problem whose subdomains have given numbers of nodes."""
+    layout = SimpleNamespace(
+        sizes=np.asarray(sizes), glued=lambda: np.asarray(glued), count=len(sizes),
+        multiplicity=lambda node: np.ones(node.size), holder=lambda node: node,
+    )  # fmt: skip
+    none = np.zeros(0)
+    contact = Contact(csr_array((0, 1)), none, none)
+    fixed = none.astype(np.int64)
+    return SimpleNamespace(layout=layout, components=2, fixed=fixed, contact=contact)
+
+
+def test_equal_subdomains_are_cut_into_equal_halves():
+    problem = subdomains([9] * 12, [5] * 12)
+    assert subdomain_ranks(problem, 2).tolist() == [0] * 6 + [1] * 6
+    assert subdomain_ranks(problem, 1).tolist() == [0] * 12
+
+
+def test_as_many_ranks_as_subdomains_have_one_subdomain_each():
+    problem = subdomains([9, 9, 900, 9, 9], [5] * 5)
+    assert subdomain_ranks(problem, 5).tolist() == list(range(5))
+    with pytest.raises(InputError, match="6 ranks for 5 subdomains; expected at most"):
+        subdomain_ranks(problem, 6)
+
+
+@pytest.mark.parametrize("ranks", [2, 3, 5])
+def test_work_is_balanced_up_to_a_subdomain_and_no_rank_is_idle(ranks):
+    rng = np.random.default_rng(ranks)
+    for _ in range(100):
+        sizes = rng.integers(1, 200, rng.integers(ranks, 60))
+        glued = rng.integers(0, sizes + 1)
+        rank = subdomain_ranks(subdomains(sizes, glued), ranks)
+        work = glued**2 / max((glued**2).sum(), 1) + sizes / sizes.sum()
+        load = np.bincount(rank, work, minlength=ranks)
+
+        assert (np.diff(rank) >= 0).all()
+        assert np.bincount(rank, minlength=ranks).min() >= 1
+        assert load.max() <= work.sum() / ranks + work.max() + 1e-12
