@@ -6,7 +6,8 @@ Each repeat runs ``python -m mortarbench solve CASE --solver smalbe --tol 1e-6 -
 --json``, from the mesh to the verdict, on N = 1 and 2, in this checkout and in each
 other CHECKOUT in turn, with the .venv of that checkout. The script prints medians, and
 the median of the ratios of wall times within a repeat to those of one process of this
-checkout. It asserts no results, because machines differ.
+checkout. Memory is `peak_mib` of the record: the solver's process, or all ranks with
+the processes that start them. It asserts no results, because machines differ.
 """
 
 import argparse
@@ -58,7 +59,9 @@ def main() -> None:
             found[checkout, ranks].append(costs)
     print(f"{options.case}, {options.repeats} repeats")
     for (checkout, ranks), costs in found.items():
-        ratios = (a["wall"] / b["wall"] for a, b in zip(costs, found[ways[0]]))
+        ratios = (
+            a["wall"] / b["wall"] for a, b in zip(costs, found[ways[0]], strict=True)
+        )
         medians = {k: median(c[k] for c in costs) for k in ("wall", "solve", "MiB")}
         print(
             f"{checkout.resolve().name:12} {ranks} ranks: wall {medians['wall']:.2f} s "
