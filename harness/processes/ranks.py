@@ -282,9 +282,9 @@ class RanksAsOne:
 
     @property
     def qp(self) -> QP:
-        """The QP that the ranks have built, or an empty QP after a failure."""
+        """The QP that the ranks have built, or that of one variable after a failure."""
         if self.host.case is None:
-            return QP.from_arrays(np.zeros((0, 0)), np.zeros(0))
+            return QP.from_arrays(np.eye(1), np.zeros(1))
         return self.host.case.qp
 
     def reported(self) -> dict[str, float]:
