@@ -1,133 +1,75 @@
-"""Speed-up of a solve on MPI ranks.
+"""Wall time, peak memory and products of a solve on one process and on two ranks.
 
-    mpiexec -n 2 .venv/bin/python -m mpi4py benchmarks/ranks.py [CASE] [REPEATS]
+    python benchmarks/ranks.py [--case CASE] [--repeats N] [CHECKOUT …]
 
-The same QP is solved `alone` on one rank and by all `ranks` together. The rounds of
-these measurements alternate. The script prints medians with minimum and maximum, and
-the times of each rank for the phases of a solve. Measurements that other processes
-disturbed by more than `MAX_DISTURBANCE` are dropped, and the number of remaining
-measurements is printed. The script requires Linux. It asserts no results, because
-machines differ.
+Each repeat runs ``python -m mortarbench solve CASE --solver smalbe --tol 1e-6 --mpi N
+--json``, from the mesh to the verdict, on N = 1 and 2, in this checkout and in each
+other CHECKOUT in turn, with the .venv of that checkout. The script prints medians, and
+the median of the ratios of wall times within a repeat to those of one process of this
+checkout. Memory is `peak_mib` of the record: the solver's process, or all ranks with
+the processes that start them. It asserts no results, because machines differ.
 """
 
-import os
-import sys
+import argparse
+import json
+import subprocess
 import time
+from pathlib import Path
 from statistics import median
 
-from mpi4py import MPI
-
-import mortarbench as mb
-from mortarbench.harness.distributed.vectors import Ranks
-from mortarbench.solvers.smalbe.solver import SMALBE
-
-CASE = "beam-ring/Nr=224/Nh=128/steps=1/feti=32/dual"
-TOL = 1e-6
-#: largest CPU time of other processes during a measurement, relative to its wall time
-MAX_DISTURBANCE = 0.04
+CASE = "beam-ring/Nr=112/Nh=64/steps=1/feti=16/dual"
 
 
-def together(comm: MPI.Comm) -> None:
-    """Wait until all ranks arrive, without keeping a CPU busy."""
-    request = comm.Ibarrier()
-    while not request.Test():
-        time.sleep(1e-3)
-
-
-def busy():
-    """Return the CPU seconds of all processes since the machine was started."""
-    with open("/proc/stat") as stat:
-        spent = [int(ticks) for ticks in stat.readline().split()[1:9]]
-    # columns 3 and 4 are the times in which a CPU was idle or waited for input
-    return (sum(spent) - sum(spent[3:5])) / os.sysconf("SC_CLK_TCK")
-
-
-def undisturbed(world, act):
-    """Call `act` on every rank, and return the local result.
-
-    Return None if other processes used more CPU time than `MAX_DISTURBANCE` allows.
-    """
-    together(world)
-    others, start = busy() - time.process_time(), time.perf_counter()
-    before = time.process_time()
-    result = act()
-    together(world)
-    ours = world.allreduce(time.process_time() - before)
-    elapsed = time.perf_counter() - start
-    others = busy() - (others + before) - ours
-    return result if world.bcast(others / elapsed) < MAX_DISTURBANCE else None
-
-
-def timed(qp, comm):
-    """Prepare and solve on the ranks of `comm`.
-
-    Return the times in s of preparing, solving and the phases of the solve, and counts
-    of operations.
-    """
-    ranks = Ranks(comm)
-    share = qp.P.build().share(qp, ranks)
-    comm.Barrier()
+def solve(checkout: Path, case: str, ranks: int) -> dict[str, float | str]:
+    """Return the costs of one solve by a command in a checkout."""
     start = time.perf_counter()
-    run = SMALBE().prepare(share.qp, TOL)
-    comm.Barrier()
-    ready = time.perf_counter()
-    ranks.clear()
-    run()
-    comm.Barrier()
-    end = time.perf_counter()
-    qp.P.forget()
-    parts = dict(ranks.seconds)
-    parts["vectors"] = end - ready - sum(parts.values())
-    return {"prepare": ready - start, "solve": end - ready} | parts | ranks.counts
-
-
-def main(name: str = CASE, repeats: str = "5") -> None:
-    """Measure, and print the table."""
-    world, alone = MPI.COMM_WORLD, MPI.COMM_SELF
-    cpus = sorted(os.sched_getaffinity(0))
-    # as in a run, each rank uses a separate CPU
-    os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})
-    qp = mb.build(name).qp
-    ways = {
-        "alone": lambda: timed(qp, alone) if world.rank == 0 else {},
-        "ranks": lambda: timed(qp, world),
+    done = subprocess.run(
+        [
+            checkout / ".venv" / "bin" / "python", "-m", "mortarbench", "solve", case,
+            "--solver", "smalbe", "--tol", "1e-6", "--mpi", str(ranks), "--json",
+        ],
+        cwd=checkout, capture_output=True, text=True,
+    )  # fmt: skip
+    seconds = time.perf_counter() - start
+    if not done.stdout:
+        raise SystemExit(f"{checkout}: {done.stderr}")
+    record = json.loads(done.stdout)
+    return {
+        "wall": seconds,
+        "solve": (record["prepare_seconds"] or 0) + (record["solve_seconds"] or 0),
+        "MiB": record["peak_mib"],
+        "products": record["counts"].get("P_products"),
+        "status": record["status"],
     }
-    results: dict[str, list[list[dict[str, float]]]] = {way: [] for way in ways}
-    rounds = int(repeats) + 1
-    for round_ in range(rounds):
-        for way, act in ways.items():
-            one = undisturbed(world, act)
-            if round_ and one is not None:  # the first round is a warm-up
-                results[way].append(world.allgather(one))
-    if world.rank:
-        return
-    print(f"{name}: {qp.q.size} multipliers, {world.size} ranks")
-    counts = ", ".join(f"{way} {len(results[way])}" for way in results)
-    print(f"  undisturbed, of {rounds - 1} rounds: {counts}")
-    if not all(results.values()):
-        return
-    for phase in ("prepare", "solve"):
-        slowest = {
-            way: [max(rank.get(phase, 0.0) for rank in one) for one in each]
-            for way, each in results.items()
-        }
-        for way, times in slowest.items():
-            print(
-                f"  {phase:8} {way:7} {median(times):8.3f} s"
-                f" [{min(times):.3f}, {max(times):.3f}]"
-            )
-        one, ranks = map(median, slowest.values())
-        print(f"  {phase:8} speed-up {one / ranks:.2f}")
-    for part in list(results["ranks"][0][0])[2:]:
-        each = "; ".join(
-            f"{way} " + ", ".join(
-                f"{median(one[rank][part] for one in of_way):.3g}"
-                for rank in range(world.size) if part in of_way[0][rank]
-            )
-            for way, of_way in results.items()
-        )  # fmt: skip
-        print(f"  solve, {part:10} {each}")
+
+
+def main() -> None:
+    """Measure in interleaved repeats, and print one line for each command."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--case", default=CASE)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("checkouts", nargs="*", type=Path, metavar="CHECKOUT")
+    options = parser.parse_args()
+    here = Path(__file__).resolve().parent.parent
+    ways = [(c, n) for c in (here, *options.checkouts) for n in (1, 2)]
+    found = {way: [] for way in ways}
+    for _ in range(options.repeats):
+        for checkout, ranks in ways:
+            costs = solve(checkout.resolve(), options.case, ranks)
+            found[checkout, ranks].append(costs)
+    print(f"{options.case}, {options.repeats} repeats")
+    for (checkout, ranks), costs in found.items():
+        ratios = (
+            a["wall"] / b["wall"] for a, b in zip(costs, found[ways[0]], strict=True)
+        )
+        medians = {k: median(c[k] for c in costs) for k in ("wall", "solve", "MiB")}
+        print(
+            f"{checkout.resolve().name:12} {ranks} ranks: wall {medians['wall']:.2f} s "
+            f"({median(ratios):.2f}), prepare + solve {medians['solve']:.3f} s, "
+            f"{medians['MiB']:.0f} MiB, {costs[0]['products']} products, "
+            f"{', '.join(sorted({c['status'] for c in costs}))}"
+        )
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -249,8 +249,7 @@ def _built(
     Returns
     -------
     the cases by name, the records that can be assessed, and the others with the reason:
-    the case of an answer cannot be rebuilt, or the QP of the record is another one. If
-    several ranks assembled a QP, its digest is computed in another way and not compared
+    the case of an answer cannot be rebuilt, or the QP of the record is another one
 
     """
     cases: dict[str, Case] = {}

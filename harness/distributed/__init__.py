@@ -1,1 +1,1 @@
-"""Solves on several MPI ranks: distributed vectors, failures and factorisation."""
+"""Solves on several ranks: communicators, linear maps and sparse factors."""

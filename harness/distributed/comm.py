@@ -19,8 +19,9 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from operator import attrgetter
 from typing import Any, NoReturn, TypeVar
 
@@ -88,10 +89,6 @@ class Comm:
     def next_order(self) -> tuple[Any, ...] | None:
         """Wait for an order of rank 0, and receive it; None ends the service."""
 
-    def is_ordered(self) -> bool:
-        """Return True if an order of rank 0 has arrived and is not yet received."""
-        return False
-
     def abort(self, failure: BaseException) -> NoReturn:
         """Report the failure of this rank, and end the processes of all ranks."""
         raise failure
@@ -153,6 +150,8 @@ class _MPIComm(Comm):
         failed = np.flatnonzero(messages.any(axis=1))
         if not failed.size:
             return result
+        # messages that the failed ranks have not received must not meet later calls
+        self._comm = self._outcomes.Dup()
         if failure is not None and (messages == message).all():
             raise failure
         first = bytes(messages[failed[0]]).rstrip(b"\0").decode(errors="replace")
@@ -170,12 +169,9 @@ class _MPIComm(Comm):
         for array in arrays:
             self._comm.Bcast(np.ascontiguousarray(array))
 
-    def is_ordered(self) -> bool:
-        return bool(self._comm.iprobe(source=0, tag=_ORDER))
-
     def next_order(self) -> tuple[Any, ...] | None:
         start = time.monotonic()
-        while not self.is_ordered():
+        while not self._comm.iprobe(source=0, tag=_ORDER):
             # a rank that keeps its CPU busy between solves would disturb others
             spins = time.monotonic() < start + _SPIN_SECONDS
             time.sleep(0 if spins else _IDLE_SECONDS)
@@ -212,44 +208,43 @@ class _Shape(tuple[Any, ...]):
 class Lead:
     """Calls of methods of an object that exists on all ranks, from rank 0.
 
-    served : the object on rank 0
+    served : the object on rank 0; None when the other ranks no longer have theirs
     name : name of the attribute, followed by a dot, of the objects with which the other
         ranks run `serve`; empty if they serve the objects themselves
     """
 
     def __init__(self, comm: Comm, served: Any, name: str = "") -> None:
-        self._comm, self._served, self._name = comm, served, name
+        self._comm, self.served, self._name = comm, served, name
 
     def __call__(self, method: str, *arguments: Any) -> Any:
         """Call a method on all ranks; return the result of rank 0.
 
+        An exception on any rank is raised here, see `Comm.together`.
+
         method : name, with dots for methods of attributes
+
+        Raises
+        ------
+        RuntimeError
+            If the ranks have built another problem in the meantime.
+
         """
+        if self.served is None:
+            raise RuntimeError("the ranks keep only the QP that they built last")
         self._comm.order((f"{self._name}{method}", *arguments))
-        return attrgetter(method)(self._served)(*arguments)
+        return self._comm.together(partial(_call, self.served, method, arguments))
 
 
 def serve(comm: Comm, served: Any) -> None:
     """Execute the methods of `served` that rank 0 calls, until it ends the service."""
     while (order := comm.next_order()) is not None:
         method, *arguments = order
-        try:
-            attrgetter(method)(served)(*arguments)
-        except BaseException as e:
-            # If rank 0 also failed, it reports the failure and sends its next order. If
-            # no order arrives, rank 0 is waiting for this rank.
-            if not _is_ordered(comm):
-                comm.abort(e)
+        with suppress(Exception):  # rank 0 raises it as well
+            comm.together(partial(_call, served, method, arguments))
 
 
-def _is_ordered(comm: Comm) -> bool:
-    """Return True if an order of rank 0 arrives within `PEER_TIMEOUT`."""
-    deadline = time.monotonic() + PEER_TIMEOUT
-    while time.monotonic() < deadline:
-        if comm.is_ordered():
-            return True
-        time.sleep(_IDLE_SECONDS)
-    return False
+def _call(served: Any, method: str, arguments: Sequence[Any]) -> Any:
+    return attrgetter(method)(served)(*arguments)
 
 
 def led(comm: Comm, served: Any, work: Callable[[], T]) -> T:

@@ -116,8 +116,8 @@ def measure_and_judge(
         if source_of(request) is not Source.RANKS:
             qp = whole()
             record = record.replace(sizes=qp.sizes)
-        elif reply.emitted is not None:
-            record = record.replace(**reply.emitted)
+        elif reply.built is not None:
+            record = record.replace(**reply.built)
         if reply.answer is None:
             return JudgedMeasurement(record.replace(verdict=reply.verdict), None)
         solution = replace(
@@ -163,7 +163,7 @@ def _with_cost(reply: Reply, record: Record) -> tuple[Record, *tuple[str, ...]]:
 
 
 def case_request(record: Record) -> dict[str, Any]:
-    """Return the entry of a request that specifies the case whose QP the ranks emit."""
+    """Return the entry of a request that specifies the case that the ranks build."""
     case = {"family": record.family, "params": dict(record.params), "form": record.form}
     return {"case": case}
 

@@ -10,8 +10,8 @@ more events. The worker ends when the pipe of requests is closed.
   worker sends ``{"event": "solved"}`` between these two events after the first solve,
   and ``{"event": "timed"}`` after the last one, when its own clock has
   stopped. The worker then waits for a line from the parent, so that the parent can read
-  the worker's CPU time. If MPI ranks emit the QP of a case, rank 0 sends ``{"event":
-  "emitted", …}`` before "start". After "timed", and before the ranks evaluate the
+  the worker's CPU time. If MPI ranks build the QP of a case, rank 0 sends ``{"event":
+  "built", …}`` before "start". After "timed", and before the ranks evaluate the
   answer, rank 0 sends ``{"event": "measured"}``.
 * ``{"event": "fault", "what": …}`` is sent instead of the next event if code of the
   harness fails.
@@ -48,7 +48,7 @@ class Events:
     #: sends "timed": the worker's clock has stopped. Returns after the parent has read
     #: the CPU time
     timed: Callable[[], None]
-    #: sends "emitted" or "measured", with the entries of the event
+    #: sends "built" or "measured", with the entries of the event
     reached: Callable[[str, Mapping[str, Any]], None]
 
 
@@ -152,16 +152,15 @@ class Source(StrEnum):
 
     #: The worker and the parent read the QP from a file; the parent judges the answer
     FILE = "file"
-    #: Each MPI rank emits its share of the QP. The parent has the entire QP and judges
-    #: the answer
+    #: MPI ranks build the QP together. The parent builds it as well and judges the
+    #: answer
     SHARES = "shares"
-    #: Each MPI rank emits its share of the QP, and the ranks jointly judge the answer.
-    #: No process has the entire QP
+    #: MPI ranks build the QP together, and rank 0 judges the answer
     RANKS = "ranks"
 
     @property
     def is_shared(self) -> bool:
-        """True if MPI ranks emit the QP."""
+        """True if MPI ranks build the QP."""
         return self is not Source.FILE
 
 

@@ -42,9 +42,10 @@ from mortarbench.harness.errors import InputError
 from mortarbench.harness.plugin import Case, CaseOnRanks, Solver
 from mortarbench.harness.processes import reaper
 from mortarbench.harness.qp import QP
-from mortarbench.harness.solution import Solution
+from mortarbench.harness.record import Verdict
+from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import memory_mib
-from mortarbench.harness.verify.verdicts import evaluated, judgement
+from mortarbench.harness.verify.verdicts import evaluated, has_point
 
 
 def launch(ranks: int, command: Sequence[str]) -> int:
@@ -215,12 +216,14 @@ class Host:
         """
         self.comm, self._build, self.limit = comm, build, limit
         self.served: Any = None
+        self._lead = Lead(comm, None)
         self.case: Case | None = None
         self.failure: Exception | None = None
 
     def build(self, case: Mapping[str, Any]) -> None:
         """Build a case together with the other ranks."""
         self.served = self.case = self.failure = None  # free memory first
+        self._lead.served = None
         try:
             built = self.comm.together(lambda: self._build(case, self.comm))
         except (InputError, RankFailedError) as e:  # all ranks raise the same error
@@ -235,7 +238,8 @@ class Host:
 
     def finish(self) -> None:
         """Complete the case on rank 0, which calls methods of all ranks."""
-        self.case = self._case(Lead(self.comm, self.served, "served."))
+        self._lead = Lead(self.comm, self.served, "served.")
+        self.case = self._case(self._lead)
 
     def peaks(self) -> list[float]:
         """Return the peak memory of each rank, in MiB."""
@@ -249,7 +253,7 @@ class RanksAsOne:
         self.host, self._lead = host, Lead(host.comm, host)
 
     def build(self, case: Mapping[str, Any]) -> dict[str, Any]:
-        """Build a case; return the entries of the event "emitted".
+        """Build a case; return the entries of the event "built".
 
         The entries are the `sizes` and the digest `qp` of the QP, and the time of the
         slowest rank, in s. They are empty after a failure.
@@ -278,9 +282,9 @@ class RanksAsOne:
 
     @property
     def qp(self) -> QP:
-        """The QP that the ranks have built, or an empty QP after a failure."""
+        """The QP that the ranks have built, or that of one variable after a failure."""
         if self.host.case is None:
-            return QP.from_arrays(np.zeros((0, 0)), np.zeros(0))
+            return QP.from_arrays(np.eye(1), np.zeros(1))
         return self.host.case.qp
 
     def reported(self) -> dict[str, float]:
@@ -300,8 +304,9 @@ class RanksAsOne:
     def judge(self, s: Solution, tol: float) -> tuple[dict[str, Any], list[str]]:
         """Judge an answer with new factors; return fields of a record, and notes."""
         case = self.host.case
-        if case is None:
-            return judgement(self.qp, s, tol)[0], []
+        # after a failure of ranks, products would fail again
+        if case is None or (s.status is Status.FAILED and not has_point(s)):
+            return {"verdict": Verdict(s.status)}, []
         # factors that code of a solver may have reached are not used
         self._lead("served.forget")
         return evaluated(case, s, tol)

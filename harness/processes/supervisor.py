@@ -124,9 +124,9 @@ class Reply:
     clock: Clock | None = None
     threads: int | None = None  #: number of threads that the worker reported
     cpu: int | None = None  #: number of the CPU to which the worker is bound
-    #: sizes, digest and build time of the QP that ranks emitted; None if they emitted
+    #: sizes, digest and build time of the QP that ranks built; None if they built
     #: no QP
-    emitted: Mapping[str, Any] | None = None
+    built: Mapping[str, Any] | None = None
 
 
 class WorkerProcess:
@@ -156,13 +156,15 @@ class WorkerProcess:
         self._warms_up = True
         self._is_warm = False
         self._is_stopped = self._was_busy = False
+        # True between the steps of a sequence on ranks, whose processes must remain
+        self._keeps_ranks = False
         # time on the parent's clock and CPU time of the worker at the last answer
         self._idle_since: tuple[float, float] | None = None
         # number of threads and CPU of the worker; see `_facts`
         self._facts: dict[str, Any] = {}
         self._footprint = Footprint()
         self._peak_mib = 0.0
-        self._emitted: dict[str, Any] | None = None  # entries of the event "emitted"
+        self._built: dict[str, Any] | None = None  # entries of the event "built"
         with _LOCK:
             self._all.add(self)
 
@@ -193,12 +195,12 @@ class WorkerProcess:
         damaged the old one.
 
         time_limit : limit in s, counted from the event "start", that is, after imports,
-            warm-up and loading of the QP. The same limit applies to the emission of the
+            warm-up and loading of the QP. The same limit applies to the build of the
             QP by ranks; the limit for their evaluation of the answer is at least
             `POINT_SECONDS`
         memory_limit : limit for all processes of the worker together, in MiB
         """
-        self._peak_mib, self._emitted = 0.0, None
+        self._peak_mib, self._built = 0.0, None
         cpu = fastest_first(os.sched_getaffinity(0))[0]
         # Stop other workers before this worker resumes, since two workers must never
         # run on one CPU.
@@ -225,7 +227,10 @@ class WorkerProcess:
         # copy these values, because `_kill` may reset them
         peak = self._peak_mib or None
         facts = self._facts
-        if self._others():  # remaining processes would disturb the next measurement
+        self._keeps_ranks = "step" in request and source_of(request).is_shared
+        if (
+            self._others() and not self._keeps_ranks
+        ):  # remaining processes would disturb the next measurement
             self._kill()
         elif self._stays_busy():
             self._kill()
@@ -237,7 +242,7 @@ class WorkerProcess:
             message="; ".join(dict.fromkeys(notes)),
             clock=clock,
             peak_mib=peak,
-            emitted=self._emitted,
+            built=self._built,
             **facts,
         )
 
@@ -272,8 +277,8 @@ class WorkerProcess:
         self._send(request)
         is_shared = source_of(request).is_shared
         if is_shared:
-            self._emitted = self._await(
-                "emitted", time_limit, memory_limit, stage="emission: "
+            self._built = self._await(
+                "built", time_limit, memory_limit, stage="build: "
             )
         self._await("start", START_SECONDS, memory_limit)
         started, used = time.monotonic(), self._cpu_seconds()
@@ -335,7 +340,7 @@ class WorkerProcess:
             message=message,
             in_repeats=end.event == "timed",
             peak_mib=peak,
-            emitted=self._emitted,
+            built=self._built,
             **self._facts,
         )
 
@@ -523,6 +528,8 @@ class WorkerProcess:
     def _stop(self) -> None:
         if self._process is None or self._is_stopped:
             return
+        if self._keeps_ranks:
+            return  # ranks sleep until the next step
         if self._others():
             self._kill()  # SIGSTOP would miss processes started after the answer
             return
@@ -647,7 +654,7 @@ class WorkerProcess:
 
     def _forget(self) -> None:
         self._process = None
-        self._is_warm = False
+        self._is_warm = self._keeps_ranks = False
         self._worker, self._is_stopped, self._was_busy = 0, False, False
         self._idle_since = None
         for name in ("_replies", "_requests", "_reaper_fd", "_worker_fd"):
@@ -714,7 +721,7 @@ class _WorkerEndError(Exception):
         self, event: str, verdict: Verdict, how: str, number: int = 0, *, stage: str
     ) -> None:
         self.event = event
-        during = ("emitted", "solved", "timed", "measured", "done")
+        during = ("built", "solved", "timed", "measured", "done")
         self.is_early = event not in during
         super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
         if self.is_early and verdict is Verdict.TIME_LIMIT:

@@ -18,7 +18,7 @@ answers three kinds of requests:
   (`harness.plugin.Family.on_ranks`), measure, and write the point to ``out``. If the
   request has the entry ``first``, the ranks build the case in that entry beforehand. If
   ``source`` is "ranks", the ranks also judge the answer at the tolerance ``judged_at``.
-  The event ``emitted`` contains the fields ``sizes``, ``qp`` and ``build_seconds`` of
+  The event ``built`` contains the fields ``sizes``, ``qp`` and ``build_seconds`` of
   the record; the event ``measured`` is sent when the point has been written
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
@@ -160,7 +160,7 @@ class _SolverHost:
         if ranks is not None:
             if "first" in request:
                 ranks.build(request["first"])
-            events.reached("emitted", ranks.build(request["case"]))
+            events.reached("built", ranks.build(request["case"]))
             qp, solver = ranks.qp, ranks.solver(solver)
         else:
             qp = self._load(request)

@@ -59,7 +59,6 @@ class Executor:
     _loaded: dict[str, QP] = field(default_factory=dict)  # QPs of `_entries`, by digest
     # limit exceeded while building the cases of the current block; None otherwise
     _limit_hit: _BuildLimitError | None = None
-    # True if ranks can emit the QP of a case, by name of the case
 
     def __post_init__(self) -> None:
         self._case_worker = WorkerProcess(
@@ -134,7 +133,7 @@ class Executor:
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
 
-        If ranks emit a QP and execute no plug-in code, the ranks also judge the
+        If ranks build a QP and execute no plug-in code, the ranks also judge the
         answer. The case is then not built.
 
         Raises
@@ -174,6 +173,8 @@ class Executor:
             if block.is_sequence and stopped:
                 yield from _unreached_steps(available[step + 1 :], record)
                 break
+        if block.is_sequence and source.is_shared:
+            self._worker(turn[0].solver).close()  # ranks remain between steps only
         for record in turn[len(available) :]:
             declined = record.replace(
                 verdict=Verdict.DECLINED, message=self._end_reason
@@ -192,7 +193,7 @@ class Executor:
         }
         if source.is_shared:
             request |= case_request(record)
-            # in a series of growing sizes, new processes emit each case
+            # in a series of growing sizes, new processes build each case
             if block.warm_up is not None:
                 self._worker(record.solver).close()
                 request["first"] = dict(block.warm_up)

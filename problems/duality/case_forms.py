@@ -22,25 +22,18 @@ from mortarbench.harness import (
     Solution,
     Vector,
 )
-from mortarbench.harness.distributed.comm import SERIAL, Lead
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.balance import least_motion
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
 from mortarbench.problems.contact.rows import ContactRows
-from mortarbench.problems.contact.stepping import Iterate
-from mortarbench.problems.duality.decomposed import cached_layout, decompose
-from mortarbench.problems.duality.dualisation import dual_bounds, dualise, primal_form
-from mortarbench.problems.duality.feti_dual import (
-    decomposition_quantities,
-    digest_of,
-    feti_dual,
-    feti_matrices,
+from mortarbench.problems.duality.dualisation import (
+    TornForm,
+    dual_bounds,
+    dualise,
+    primal_form,
 )
-from mortarbench.problems.duality.monolithic import (
-    MonolithicLinearisation,
-    monolithic_path,
-)
+from mortarbench.problems.duality.monolithic import monolithic_path
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
@@ -49,9 +42,6 @@ from mortarbench.problems.duality.problem import (
 )
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import Mesh, Nodes
-from mortarbench.problems.feti.mechanics import torn_mechanics
-from mortarbench.problems.feti.served import Served
-from mortarbench.problems.feti.subdomains import Contact, TornBodies
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -67,16 +57,14 @@ def case_of(
     form : one of FORMS
     """
     elastic = problem.bodies
-    path, decomposed, digest = monolithic_path(problem, reference), None, ""
+    path, torn = monolithic_path(problem, reference), None
     chosen = path.problem(choice.step, choice.iterate)
     whole, friction, _ = chosen
     primal, count = whole.primal, path.iterates(choice.step)
     if choice.size:
-        decomposed = _torn(problem, choice, path.last_of(choice.step), chosen)
-        others, first = path.before(choice.step, chosen), decomposed
-        if others:
-            first = _torn(problem, choice, 0, path.problems(0)[0])
-        digest = digest_of(first.torn, Lead(SERIAL, first), others)
+        from mortarbench.problems.duality.torn_form import torn_form
+
+        torn = torn_form(problem, path, choice, chosen)
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
@@ -90,7 +78,7 @@ def case_of(
         primal,
         whole.rows,
         form,
-        parts=decomposed,
+        torn=torn,
         floating=lambda: elastic.floating,
         clamped=lambda: elastic.clamped,
         supported=lambda: elastic.supported,
@@ -98,27 +86,7 @@ def case_of(
         friction=friction,
         settle=lambda s: least_motion(bodies.rigid, primal, s, friction),
     )
-    case = replace(case, digest=digest)
     return case if problem.exact is None else with_exact_tractions(case, problem.exact)
-
-
-def _torn(
-    problem: ContactProblem,
-    choice: Choice,
-    stage: int,
-    linearised: Iterate[MonolithicLinearisation],
-) -> Served:
-    """Return the subdomains with the rows of a problem that was linearised.
-
-    stage : number of the stage of the problem
-    """
-    elastic, friction = problem.bodies, linearised.friction
-    rows, c = contact_rows(linearised.problem.primal, friction)
-    contact = Contact(rows, c, friction.bound, friction.tangents)
-    layout = cached_layout(elastic, choice.size)
-    of_stage = problem.stages[stage]
-    parts = decompose(elastic, layout, choice.glue, of_stage, contact)
-    return Served(TornBodies(parts))
 
 
 def with_exact_tractions(case: Case, exact: NDArray[np.float64]) -> Case:
@@ -169,7 +137,7 @@ def contact_case(
     supported: Factorise,
     quantities: Callable[[Solution], Mapping[str, Any]],
     friction: Friction = NO_FRICTION,
-    parts: Served | None = None,
+    torn: TornForm | None = None,
 ) -> Case:
     """Return the case, in one of FORMS, of a contact problem with a given primal QP.
 
@@ -188,20 +156,16 @@ def contact_case(
         problem; z of this solution lists the multipliers of the contact rows, then
         those of the friction rows
     friction : friction law with a prescribed bound; the objective includes its work
-    parts : decomposed bodies; if present, `form` is ignored and the case is their dual
+    torn : dual of decomposed bodies; if present, `form` is ignored
 
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, by_subdomains, subdomains = None, None, None
-    if parts is not None:
-        start = perf_counter()
-        transformed = feti_dual(parts, primal, friction)
-        seconds = perf_counter() - start
-        subdomains = parts.torn.problem.layout.label
-        by_subdomains = torn_mechanics(parts, Lead(SERIAL, parts), primal.P)
-        matrices = feti_matrices(parts, transformed.qp)
-        decomposition = decomposition_quantities(parts, transformed.qp)
+    seconds, by_subdomains, label, digest = None, None, None, ""
+    if torn is not None:
+        transformed, seconds, matrices, decomposition, by_subdomains, label, digest = (
+            torn
+        )
     elif form == "primal":
         transformed = primal_form(primal, friction)
     else:
@@ -234,8 +198,9 @@ def contact_case(
             recovered(s),
             rows,
             friction,
-            subdomains=subdomains,
+            subdomains=label,
         ),
+        digest=digest,
         scale=transformed.sign * energy,
         constant=transformed.constant * energy,
         matrices=matrices,

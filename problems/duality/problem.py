@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, wraps
-from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,17 +43,9 @@ from mortarbench.problems.fem.mesh import (
     join,
     joined_sides,
 )
-from mortarbench.problems.feti.partition import graph_partition
-from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdivision import (
-    Subdivision,
-    half_discs_in_blocks,
-    mesh_in_subdomains,
-)
-from mortarbench.problems.feti.tearing import (
-    compact_blocks,
-    compact_boxes,
-)
+
+if TYPE_CHECKING:
+    from mortarbench.problems.feti.subdivision import Subdivision
 
 #: function that linearises contact at a displacement (n,) in m
 Linearise: TypeAlias = Callable[[Vector], ContactRows]
@@ -118,8 +110,10 @@ class _Joined(Generic[B]):
 class StructuredGrids(_Joined[StructuredGrid]):
     """Structured grids; subdomains have at most size² cells."""
 
-    def layout(self, size: int) -> Layout:
+    def layout(self, size: int) -> Subdivision:
         """Cut each grid into blocks of at most `size` cells per side."""
+        from mortarbench.problems.feti.structured import Layout
+
         return Layout.of(self.parts, size)
 
 
@@ -132,6 +126,9 @@ class HalfDiscs(_Joined[HalfDisc]):
         The cuts keep the aspect ratios of blocks near 1. The triangles at the centre
         count as the last ring of cells.
         """
+        from mortarbench.problems.feti.subdivision import half_discs_in_blocks
+        from mortarbench.problems.feti.tearing import compact_blocks
+
         blocks = [compact_blocks(disc.lengths(), size) for disc in self.parts]
         return half_discs_in_blocks(self.parts, blocks)
 
@@ -168,6 +165,9 @@ class StructuredSolids:
 
     def layout(self, size: int) -> Subdivision:
         """Cut each box into compact blocks of at most `size` cells per side."""
+        from mortarbench.problems.feti.subdivision import mesh_in_subdomains
+        from mortarbench.problems.feti.tearing import compact_boxes
+
         labels = [
             compact_boxes(mesh.points.reshape(z + 1, y + 1, x + 1, 3), size)
             for mesh, (x, y, z) in zip(self.parts, self.divisions, strict=True)
@@ -198,6 +198,9 @@ class Meshed:
 
     def layout(self, size: int) -> Subdivision:
         """Cut the bodies into `size` subdomains by graph partitioning."""
+        from mortarbench.problems.feti.partition import graph_partition
+        from mortarbench.problems.feti.subdivision import mesh_in_subdomains
+
         label = graph_partition(self.mesh.points, self.mesh.cells, self.body, size)
         return mesh_in_subdomains(self.mesh, label, self.body, self.named)
 

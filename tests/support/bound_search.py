@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from mortarbench.harness import Solution, Status
+from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.mechanics import Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.admissible import UncertifiableError
 from mortarbench.harness.verify.certificate import certify_pair
-from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.decomposed_bodies import mechanics_of, parts_of

@@ -1,8 +1,6 @@
 """Measurements in which one rank fails, for each stage of a measurement."""
 
-import json
 import os
-import select
 import subprocess
 import sys
 from contextlib import suppress
@@ -12,28 +10,15 @@ from pathlib import Path
 import pytest
 
 import mortarbench as mb
-from mortarbench.harness.distributed import failures
 from mortarbench.harness.processes import supervisor
 from tests.support import ROOT, SUPPORT
 from tests.support.waiting import soon
 
 pytestmark = pytest.mark.together
 
-SUITE = """
-name = "ranks"
-tolerances = [1e-6]
-repeats = 1
-time_limit = {limit}
-memory_limit = 4096
-solvers = ["smalbe"]
-ranks = [2]
-[[problems]]
-family = "beam-ring"
-forms = ["dual"]
-params = {{ Nr = 4, Nh = 3, steps = 1, feti = 4 }}
-"""
-MEASURING = ("emission", "prepare", "solve")
-EVALUATING = ("residuals", "quantities")
+CASE = "beam-ring/Nr=2/Nh=1/steps=1/feti=2/dual"
+MEASURING = ("build", "prepare", "product")
+EVALUATING = ("certificate", "quantities")
 #: time limit of each stage in s, sufficient for the stages before the planted failure
 LIMIT = 20
 KILLED = "rank 1 of 2 ranks ended: Killed"
@@ -42,7 +27,7 @@ RAISED = "rank 1 of 2: ValueError: planted"
 
 @pytest.fixture
 def measured(tmp_path, monkeypatch):
-    """Measure once with a failing rank; assert that no process remains."""
+    """Solve once with a failing rank; assert that no process remains."""
 
     def run(stage, kind, rank="1", limit=LIMIT):
         monkeypatch.setenv("FAULT", str(tmp_path))
@@ -52,12 +37,9 @@ def measured(tmp_path, monkeypatch):
         paths = [str(SUPPORT / "faulty_ranks"), os.environ.get("PYTHONPATH", "")]
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
         monkeypatch.setattr(supervisor, "POINT_SECONDS", limit)
-        suite = tmp_path / "ranks.toml"
-        suite.write_text(SUITE.format(limit=limit))
-        results = mb.run(suite, out=tmp_path / "out")
+        record = mb.solve(CASE, "smalbe", tol=1e-6, ranks=2, time_limit=limit).record
         assert soon(lambda: not processes_of(tmp_path))
-        (record,) = results.records
-        assert mb.load(tmp_path / "out").records == results.records
+        assert "\n" not in record.message
         return record
 
     return run
@@ -76,26 +58,43 @@ def processes_of(mark):
     return found
 
 
-def test_records_of_ranks_do_not_mix(monkeypatch):
-    """Each record is one line, written atomically with at most PIPE_BUF bytes."""
-    written = []
-    monkeypatch.setattr(os, "write", lambda fd, data: written.append((fd, data)))
-    monkeypatch.setenv(failures.RECORD, "7")
-    failures.record(1, "ValueError: \n" + "δ" * 10_000)
+def test_a_rank_that_is_killed_in_a_product_is_named(measured):
+    record = measured("product", "killed")
 
-    ((fd, line),) = written
-    assert fd == 7
-    assert line.count(b"\n") == 1
-    assert line.endswith(b"\n")
-    assert len(line) < select.PIPE_BUF
-    assert json.loads(line)["rank"] == 1
+    assert record.verdict == "crashed"
+    assert KILLED in record.message
 
 
-def test_a_rank_that_hangs_while_it_emits_is_ended_at_the_time_limit(measured):
-    record = measured("emission", "hangs", limit=2)
+def test_a_case_that_one_rank_cannot_build_fails_with_the_reason(measured):
+    record = measured("build", "raises-after")
+
+    assert record.verdict == "failed"
+    assert RAISED in record.message
+
+
+def test_an_exception_in_a_product_of_one_rank_reaches_the_solver(measured):
+    """Rank 0 has computed the product, but no sum of it."""
+    record = measured("product", "raises-after")
+
+    assert (record.verdict, record.claimed) == ("failed", "failed")
+    assert RAISED in record.message
+
+
+def test_a_rank_that_cannot_certify_is_named_and_the_verdict_is_kept(measured):
+    record = measured("certificate", "raises-after")
+
+    assert record.verdict == "verified"
+    assert f"no energy_bound: RankFailedError: {RAISED}" in record.message
+    assert record.energy_bound is None
+    assert record.quantities["dofs"] > 0
+
+
+@pytest.mark.slow
+def test_a_rank_that_hangs_while_it_builds_is_ended_at_the_time_limit(measured):
+    record = measured("build", "hangs", limit=4)
 
     assert record.verdict == "time_limit"
-    assert record.message == "emission: killed after 2 s"
+    assert record.message == "build: killed after 4 s"
 
 
 @pytest.mark.slow
@@ -120,9 +119,8 @@ def test_a_rank_that_exits_with_0_before_the_others_is_named(measured, stage, ra
 
 
 @pytest.mark.slow  # `test_first_rank.py` tests interleaved output without a solve
-@pytest.mark.parametrize("stage", ["solve"])
-def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured, stage):
-    record = measured(stage, "prints")
+def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured):
+    record = measured("product", "prints")
 
     assert record.verdict == "crashed"
     assert record.message.endswith(f"{KILLED} (signal 9)")
@@ -140,68 +138,71 @@ def test_a_hanging_rank_is_killed_in_every_stage(measured, stage):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("stage", "rank"), list(product(MEASURING + EVALUATING, ["0", "1"]))
+    ("stage", "rank"), list(product(("build", "product"), ["0", "1"]))
 )
-def test_an_exception_on_one_rank_does_not_leave_others_waiting(measured, stage, rank):
+def test_a_rank_that_fails_while_others_wait_for_it_is_named(measured, stage, rank):
+    """The others wait in a sum, so that the failed rank ends the processes."""
     record = measured(stage, "raises", rank=rank)
 
-    if rank == "0" and stage in ("prepare", "solve"):  # the solver on rank 0
-        assert (record.verdict, record.claimed) == ("failed", "failed")
-        assert "ValueError: planted" in record.message
-    else:
-        assert record.verdict == "crashed"
-        assert f"rank {rank} of 2: ValueError: planted" in record.message
-        assert names_stage(record.message, stage)
+    assert record.verdict in ("failed", "crashed")
+    assert f"rank {rank} of 2: ValueError: planted" in record.message
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rank", ["1", "all"])
-def test_a_case_that_ranks_cannot_emit_fails_with_the_reason(measured, rank):
-    record = measured("emission", "raises-after", rank=rank)
+@pytest.mark.parametrize("stage", MEASURING)
+def test_an_exception_on_all_ranks_is_the_message_of_the_solver(measured, stage):
+    record = measured(stage, "raises", rank="all")
 
     assert record.verdict == "failed"
-    said = RAISED if rank == "1" else "ValueError: planted"
-    assert f"emission: {said}" in record.message
+    assert "ValueError: planted" in record.message
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rank", ["1", "all"])
-def test_an_answer_that_ranks_cannot_verify_is_verified_by_one_process(measured, rank):
-    record = measured("residuals", "raises-after", rank=rank)
+@pytest.mark.parametrize("stage", EVALUATING)
+def test_a_failing_evaluation_does_not_affect_the_verdict(measured, stage, rank):
+    record = measured(stage, "raises-after", rank=rank)
 
     assert record.verdict == "verified"
-    assert "no evaluation by ranks" in record.message
-    assert record.energy_bound < 1e-5
-    assert record.quantities["dofs"] == 848
+    assert "ValueError: planted" in record.message
+    assert (record.energy_bound is None) == (stage == "certificate")
+    assert (not record.quantities) == (stage == "quantities")
 
 
-@pytest.mark.slow
-def test_failing_quantities_affect_neither_verdict_nor_bound(measured):
-    record = measured("quantities", "raises-after", rank="all")
+SUITE = """
+name = "ranks"
+tolerances = [1e-6]
+repeats = {repeats}
+time_limit = 60
+memory_limit = {limit}
+solvers = ["smalbe"]
+ranks = [2]
+[[problems]]
+family = "beam-ring"
+forms = ["dual"]
+params = {{ Nr = 4, Nh = 3, steps = 1, feti = 4 }}
+"""
 
-    assert record.verdict == "verified"
-    assert "no quantities: ValueError: planted" in record.message
-    assert record.energy_bound < 1e-5
+
+def test_the_memory_limit_is_for_the_sum_over_all_ranks(tmp_path):
+    """The limit is above the memory of a single process."""
+    suite = tmp_path / "ranks.toml"
+    text = SUITE.format(repeats=1, limit=110)
+    suite.write_text(text.replace("[2]", "[1, 2]"))
+    found = {r.ranks: r for r in mb.run(suite, out=tmp_path / "out").records}
+    assert found[1].verdict == "verified"
+    assert found[2].verdict == "memory_limit"
+    assert "above the limit of 110 MiB" in found[2].message
 
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_while_ranks_measure_is_continued(tmp_path):
     suite, out = tmp_path / "ranks.toml", tmp_path / "out"
-    text = SUITE.format(limit=60).replace("repeats = 1", "repeats = 3")
-    suite.write_text(text)
-    command = [
-        sys.executable,
-        "-m",
-        "mortarbench",
-        "run",
-        str(suite),
-        "--out",
-        str(out),
-    ]
-    environment = os.environ | {"FAULT": str(tmp_path)}
+    suite.write_text(SUITE.format(repeats=3, limit=4096))
     run = subprocess.Popen(
-        command, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
+        [sys.executable, "-m", "mortarbench", "run", suite, "--out", out],
+        cwd=ROOT, env=os.environ | {"FAULT": str(tmp_path)},
+        stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     assert soon(lambda: journal_lines(out))
     assert soon(lambda: any(is_rank(pid) for pid in processes_of(tmp_path)))
@@ -233,6 +234,6 @@ def is_rank(process):
 
 def names_stage(message, stage):
     """Return True if a message has the prefix of its stage; some stages have none."""
-    if stage == "emission":
-        return message.startswith("emission: ")
+    if stage == "build":
+        return message.startswith("build: ")
     return message.startswith("evaluation of the answer: ") == (stage in EVALUATING)

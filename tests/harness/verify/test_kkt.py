@@ -14,10 +14,8 @@ from mortarbench.harness import (
     Solution,
     Status,
     Verdict,
-    no_rows,
     verdict,
 )
-from mortarbench.harness.distributed.vectors import DistributedColumns, distributed
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.harness.record import Record
 from mortarbench.harness.verify.kkt import (
@@ -27,7 +25,7 @@ from mortarbench.harness.verify.kkt import (
     rejudged,
     scaling_of,
 )
-from mortarbench.harness.verify.verdicts import gathered, judged
+from mortarbench.harness.verify.verdicts import judged
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.adapters.osqp_ import OSQP
@@ -35,7 +33,6 @@ from mortarbench.solvers.adapters.proxqp_ import ProxQP
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 from tests.support.small_qps import at
-from tests.support.threads import on_threads
 
 INF = np.inf
 qp_of = QP.from_arrays
@@ -314,62 +311,6 @@ def test_rounding_in_products_with_an_operator_does_not_refute_an_answer():
 @pytest.mark.parametrize("d", [0, 4])
 def test_the_largest_eigenvalue_may_be_zero(d):
     assert largest_eigenvalue(qp_of(np.diag([0, d]), [1, 1])) == pytest.approx(d)
-
-
-class Diagonal:
-    """Diagonal P of a QP with distributed vectors."""
-
-    def __init__(self, d):
-        self.d, self.shape = d, (d.size, d.size)
-
-    def __matmul__(self, x):
-        return self.d * x
-
-    def diagonal(self):
-        return self.d
-
-
-def test_ranks_gather_the_residuals_of_one_process():
-    """The last of three ranks has neither bounds nor a disc."""
-    rng = np.random.default_rng(5)
-    d, q, x, z = 1 + rng.random((4, 12))
-    A, y, b = rng.random((1, 12)), np.ones(1), np.ones(1)
-    lb = np.where(np.arange(12) % 4 < 2, 0.5, -INF)
-    lb[8:] = -INF
-    ub = np.where(np.arange(12) < 2, 1.1, INF)
-    index, radius = np.array([[2, 3], [6, 7]]), np.array([1.0, 0.5])
-
-    def residuals(ranks=None):
-        if ranks is None:
-            qp = QP(P=Diagonal(d), q=q, A=A, b=b, G=no_rows(12), h=np.zeros(0),
-                    lb=lb, ub=ub, sets=(Discs(index, radius),))  # fmt: skip
-            return kkt_residuals(qp, at(x, y, z_box=z))
-        first = 4 * ranks.rank
-
-        def part(v):
-            return distributed(v[first : first + 4], ranks)
-
-        mine = slice(0) if ranks.rank == 2 else slice(ranks.rank, ranks.rank + 1)
-        discs = OwnDiscs(index[mine] - first, radius[mine])
-        share = QP(
-            P=Diagonal(part(d)), q=part(q), b=b, h=np.zeros(0),
-            A=DistributedColumns(csr_array(A[:, first : first + 4]), ranks),
-            G=DistributedColumns(csr_array((0, 4)), ranks),
-            lb=part(lb), ub=part(ub), sets=(discs,),
-        )  # fmt: skip
-        s = replace(at(x, y), x=part(x), z_box=part(z))
-        return kkt_residuals(*gathered(share, s, ranks))
-
-    alone = residuals()
-    assert alone.primal > 1e-3
-    for there in on_threads(3, residuals):
-        assert there == pytest.approx(alone, rel=1e-13)
-
-
-class OwnDiscs(Discs):
-    """Discs of one rank."""
-
-    may_be_empty = True
 
 
 # --- verdicts -------------------------------------------------------------------------

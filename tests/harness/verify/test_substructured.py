@@ -17,11 +17,11 @@ from numpy.testing import assert_allclose
 from scipy.sparse import block_diag
 
 from mortarbench.harness import Mechanics, Solution, Status, UncertifiableError, certify
+from mortarbench.harness.crossval.references import ReferencePoint, reference_point
 from mortarbench.harness.mechanics import DecomposedMechanics, Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.sets.convex import hull
 from mortarbench.harness.verify.certificate import Certificate, certify_pair
-from mortarbench.harness.verify.references import ReferencePoint, reference_point
 from mortarbench.harness.verify.substructured import Subdomains, neighbour
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies

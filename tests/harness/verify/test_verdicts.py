@@ -9,21 +9,12 @@ import pytest
 from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Case, Solution, Status, Verdict
-from mortarbench.harness.distributed.vectors import (
-    DistributedColumns,
-    DistributedQP,
-    Evaluation,
-    Ranks,
-    Share,
-    distributed,
-)
 from mortarbench.harness.names import CaseId
-from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.verify.certificate import UncertifiableError
 from mortarbench.harness.verify.verdicts import (
     certified,
-    evaluated_by_ranks,
+    evaluated,
     judged,
     new_record,
     quantities_of,
@@ -176,74 +167,19 @@ def test_the_time_of_certification_is_recorded_with_or_without_a_bound(
         assert (fields, note) == ({}, "no energy_bound: no admissible pair")
 
 
-class SerialComm:
-    """Communicator of a single process."""
+def test_an_answer_is_judged_completely():
+    """The ranks judge their answers by this function."""
+    fields, notes = evaluated(case(lambda s: {"first": np.float64(0.25)}), POINT, 1e-8)
 
-    size, rank = 1, 0
-
-    def Dup(self):
-        return self
-
-    def allgather(self, value):
-        return [value]
-
-    def Allgather(self, part, everyones):
-        everyones[0] = part
-
-    def Iallgather(self, part, everyones):
-        self.Allgather(part, everyones)
-        return SimpleNamespace(Wait=lambda: None, Test=lambda: True)
+    assert fields["verdict"] is Verdict.VERIFIED
+    assert fields["objective"] == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
+    assert fields["quantities"] == {"first": 0.25}
+    assert fields["recover_seconds"] >= 0
+    assert not any(notes)
 
 
-def on_one_rank(x=POINT.x, quantities=None):
-    """Evaluate a point of `QP_` on one rank; the bound x₁ ≤ ¼ replaces the row of G."""
-    ranks = Ranks(SerialComm())
+def test_quantities_that_fail_do_not_discard_the_judgement():
+    fields, notes = evaluated(case(fault), POINT, 1e-8)
 
-    def slices(v):
-        return distributed(np.array(v, dtype=float), ranks)
-
-    def share():
-        unit = SerialisableOperator(2, "unit", {}, {"unit": lambda _: slices})
-        qp = replace(
-            QP_, P=unit, q=slices(QP_.q), A=DistributedColumns(QP_.A, ranks),
-            G=DistributedColumns(QP_.G[:0], ranks), h=QP_.h[:0],
-            lb=slices(QP_.lb), ub=slices([0.25, np.inf]),
-        )  # fmt: skip
-        return Share(qp, lambda s: s)
-
-    answered = Evaluation(quantities)
-    emitted = DistributedQP(2, 1, 3, share, lambda: "", lambda s: answered)
-    s = replace(POINT, x=slices(x), z=QP_.h[:0], z_box=slices([0.5, 0]))
-    return evaluated_by_ranks(emitted, s, ranks)
-
-
-def test_ranks_compute_the_objective_and_zero_residuals_of_a_solution():
-    found = on_one_rank()
-
-    values = found.pop("values")
-    assert values.pop("objective") == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
-    assert max(values.values()) <= 1e-15
-    assert found.pop("notes") == []
-    assert set(found.values()) == {None}  # all other results are missing
-
-
-def test_ranks_return_no_results_for_a_point_that_is_not_finite():
-    found = on_one_rank([np.nan, 1], quantities=lambda: {"first": 0.25})
-
-    assert found.pop("notes") == []
-    assert set(found.values()) == {None}
-
-
-def test_ranks_return_physical_results_as_plain_numbers():
-    found = on_one_rank(quantities=lambda: {"first": np.float64(0.25)})
-
-    assert found["quantities"] == {"first": 0.25}
-    assert type(found["quantities"]["first"]) is float
-    assert found["recover_seconds"] >= 0
-
-
-def test_results_that_fail_on_ranks_are_empty_with_a_one_line_note():
-    found = on_one_rank(quantities=lambda: fault(None))
-
-    assert found["quantities"] == {}
-    assert found["notes"] == ["no quantities: ZeroDivisionError: two lines"]
+    assert (fields["verdict"], fields["quantities"]) == (Verdict.VERIFIED, {})
+    assert "no quantities: ZeroDivisionError: two lines" in notes

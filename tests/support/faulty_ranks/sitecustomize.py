@@ -19,11 +19,14 @@ from importlib.machinery import PathFinder
 
 #: stage → module, and function or method that fails
 STAGES = {
-    "emission": ("mortarbench.problems.feti.distributed_dual", "distributed_qp"),
-    "prepare": ("mortarbench.solvers.smalbe.solver", "SMALBE.prepare"),
-    "solve": ("mortarbench.solvers.smalbe.solver", "SMALBE.prepare"),
-    "residuals": ("mortarbench.harness.verify.verdicts", "_values_by_ranks"),
-    "quantities": ("mortarbench.problems.duality.decomposed", "_largest_von_mises"),
+    "build": ("mortarbench.problems.duality.decomposed", "case_on_ranks"),
+    "prepare": ("mortarbench.problems.feti.operators", "DualOperator.prepare"),
+    "product": ("mortarbench.problems.feti.operators", "DualOperator.__call__"),
+    "certificate": (
+        "mortarbench.problems.feti.substructures",
+        "LocalProblems.squared_product",
+    ),
+    "quantities": ("mortarbench.problems.duality.decomposed", "largest_stresses"),
 }
 KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
 
@@ -49,26 +52,11 @@ def failing(work):
     return fails
 
 
-def in_stage(work):
-    """Return a function that fails in the stage, except during the warm-up."""
-    if STAGE not in ("prepare", "solve"):
-        return failing(work)
-
-    def prepare(solver, qp, tol):
-        if type(qp.A).__name__ != "DistributedColumns":
-            return work(solver, qp, tol)
-        if STAGE == "prepare":
-            return failing(work)(solver, qp, tol)
-        return failing(work(solver, qp, tol))
-
-    return prepare
-
-
 class Planter:
     """Import hook that replaces the function of the stage in its module."""
 
     def find_spec(self, name, path=None, target=None):
-        module, _, of = STAGES[STAGE][0], *STAGES[STAGE]
+        module, of = STAGES[STAGE]
         if name != module:
             return None
         spec = PathFinder.find_spec(name, path, target)
@@ -78,7 +66,7 @@ class Planter:
             run(loaded)
             *holder, last = of.split(".")
             where = getattr(loaded, holder[0]) if holder else loaded
-            setattr(where, last, in_stage(getattr(where, last)))
+            setattr(where, last, failing(getattr(where, last)))
 
         spec.loader.exec_module = exec_module
         return spec

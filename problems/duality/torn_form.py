@@ -1,0 +1,70 @@
+"""The dual of decomposed bodies on one process, beside the undivided bodies."""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+from mortarbench.harness.distributed.comm import SERIAL, Lead
+from mortarbench.harness.mechanics import contact_rows
+from mortarbench.problems.contact.stepping import Iterate
+from mortarbench.problems.duality.decomposed import cached_layout, decompose
+from mortarbench.problems.duality.dualisation import TornForm
+from mortarbench.problems.duality.feti_dual import (
+    decomposition_quantities,
+    digest_of,
+    feti_dual,
+    feti_matrices,
+)
+from mortarbench.problems.duality.monolithic import (
+    MonolithicLinearisation,
+    MonolithicPath,
+)
+from mortarbench.problems.duality.problem import Choice, ContactProblem
+from mortarbench.problems.feti.mechanics import torn_mechanics
+from mortarbench.problems.feti.served import Served
+from mortarbench.problems.feti.subdomains import Contact, TornBodies
+
+
+def torn_form(
+    problem: ContactProblem,
+    path: MonolithicPath,
+    choice: Choice,
+    chosen: Iterate[MonolithicLinearisation],
+) -> TornForm:
+    """Return the dual in subdomains of the problem `chosen` of a load path."""
+    served = _torn(problem, choice, path.last_of(choice.step), chosen)
+    lead, primal = Lead(SERIAL, served), chosen.problem.primal
+    start = perf_counter()
+    dual = feti_dual(served, primal, chosen.friction)
+    seconds = perf_counter() - start
+    others, first = path.before(choice.step, chosen), served
+    if others:
+        first = _torn(problem, choice, 0, path.problems(0)[0])
+    return TornForm(
+        transformed=dual,
+        seconds=seconds,
+        matrices=feti_matrices(served, dual.qp),
+        quantities=decomposition_quantities(served, dual.qp),
+        mechanics=torn_mechanics(served, lead, primal.P),
+        label=served.torn.problem.layout.label,
+        digest=digest_of(first.torn, Lead(SERIAL, first), others),
+    )
+
+
+def _torn(
+    problem: ContactProblem,
+    choice: Choice,
+    stage: int,
+    linearised: Iterate[MonolithicLinearisation],
+) -> Served:
+    """Return the subdomains with the rows of a problem that was linearised.
+
+    stage : number of the stage of the problem
+    """
+    elastic, friction = problem.bodies, linearised.friction
+    rows, c = contact_rows(linearised.problem.primal, friction)
+    contact = Contact(rows, c, friction.bound, friction.tangents)
+    layout = cached_layout(elastic, choice.size)
+    of_stage = problem.stages[stage]
+    parts = decompose(elastic, layout, choice.glue, of_stage, contact)
+    return Served(TornBodies(parts))
