@@ -104,6 +104,8 @@ def _shared(size: int, barriers: list[Barrier]) -> SimpleNamespace:
     barriers : barriers of all communicators of these ranks
     """
     barriers.append(Barrier(size))
+    if barriers[0].broken:  # a rank has ended all ranks
+        barriers[-1].abort()
     return SimpleNamespace(
         barrier=barriers[-1], barriers=barriers, slots=[b""] * size, gathered={},
         copies={}, inboxes=[SimpleQueue() for _ in range(size)],
