@@ -122,9 +122,8 @@ class DecomposedProblem:
     def contact_scale(self) -> Vector:
         """Scale √E/‖B_i‖ of each contact row (m,), with E of the softest body touched.
 
-        B_i is the row on the torn unknowns before scaling. The scales of all rows of a
-        tangential vector are equal in exact arithmetic and are set to that of its first
-        row.
+        B_i is the row on the torn unknowns before scaling. All rows of a tangential
+        vector have the scale of its first row, so that discs remain discs.
         """
         rows, of = self.contact.rows, self.layout
         if not rows.shape[0]:

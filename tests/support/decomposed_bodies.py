@@ -65,8 +65,13 @@ def parts_by(
     """Return the QP of the bodies and its friction on the subdomains."""
     of = elastic_bodies_of(replace(bodies, f=-primal.q))
     (stage,) = load_steps(1, 1, of.forces, of.fixed)
-    contact = Contact(*contact_rows(primal, friction), friction.bound)
-    return decompose(of, layout, rows, stage, contact)
+    return decompose(of, layout, rows, stage, contact_of(primal, friction))
+
+
+def contact_of(primal: QP, friction: Friction) -> Contact:
+    """Return the contact and friction rows of undivided bodies."""
+    rows, c = contact_rows(primal, friction)
+    return Contact(rows, c, friction.bound, friction.tangents)
 
 
 def parts_of(name: str) -> DecomposedProblem:
@@ -80,7 +85,7 @@ def parts_of(name: str) -> DecomposedProblem:
         path = monolithic_path(problem, reference_solution)
         whole, friction, _ = path.problem(choice.step, choice.iterate)
         of, stage = problem.bodies, problem.stages[path.last_of(choice.step)]
-        contact = Contact(*contact_rows(whole.primal, friction), friction.bound)
+        contact = contact_of(whole.primal, friction)
         layout = of.shape.layout(choice.size)
         return decompose(of, layout, choice.glue, stage, contact)
     models = import_module(f"mortarbench.problems.models.{case.family.name}")

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
+from mortarbench.harness.distributed.comm import SERIAL
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import certify
 from mortarbench.problems import PROBLEMS
+from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.gmsh_files import msh22, solids22, square, stacked_mesh
 from tests.support.solid_blocks import solid_blocks
@@ -100,6 +102,15 @@ def test_a_prescribed_displacement_compresses_a_column(column, form, contact):
     # energy = scale·objective + constant, in the dual as in the primal form
     energy = case.scale * case.qp.objective(s.x) + case.constant
     assert energy == pytest.approx(values["energy"], rel=1e-8)
+
+
+def test_prescribed_displacements_on_ranks_are_refused(column):
+    more = BASE + '[[supports]]\nboundary = "top"\ndisplacement = ["free", -0.004]\n'
+    column(more)
+    case = parse("bodies:a.toml/parts=4/dual", PROBLEMS)
+    build = case.family.on_ranks(case.form, case.params)
+    with pytest.raises(InputError, match="displacements on MPI ranks are not built"):
+        build(SERIAL, reference_of_operator)
 
 
 @pytest.mark.parametrize("form", ["primal", "dual-bounds", "parts=4/dual"])

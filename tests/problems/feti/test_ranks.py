@@ -292,22 +292,29 @@ def generated(rng):
     yield f"greco/n={n[7] + 4}/mu={rng.choice([0, 0.4, 1])}/feti={n[0] % 3 + 1}"
 
 
-def subdomains(sizes, glued):
-    """Return a problem whose subdomains have given numbers of nodes."""
+def subdomains(sizes, glued, fixed=0):
+    """Return a problem with given numbers of nodes, and of fixed components of the
+    first subdomain."""
     layout = SimpleNamespace(
         sizes=np.asarray(sizes), glued=lambda: np.asarray(glued), count=len(sizes),
-        multiplicity=lambda node: np.ones(node.size), holder=lambda node: node,
+        multiplicity=lambda node: np.ones(node.size), holder=lambda node: node // 10,
     )  # fmt: skip
     none = np.zeros(0)
     contact = Contact(csr_array((0, 1)), none, none)
-    fixed = none.astype(np.int64)
-    return SimpleNamespace(layout=layout, components=2, fixed=fixed, contact=contact)
+    return SimpleNamespace(
+        layout=layout, components=2, fixed=np.arange(fixed), contact=contact
+    )
 
 
 def test_equal_subdomains_are_cut_into_equal_halves():
     problem = subdomains([9] * 12, [5] * 12)
     assert subdomain_ranks(problem, 2).tolist() == [0] * 6 + [1] * 6
     assert subdomain_ranks(problem, 1).tolist() == [0] * 12
+
+
+def test_nodes_of_supports_count_as_work_like_nodes_of_interfaces():
+    problem = subdomains([20] * 4, [1] * 4, fixed=20)
+    assert subdomain_ranks(problem, 2).tolist() == [0, 1, 1, 1]
 
 
 def test_as_many_ranks_as_subdomains_have_one_subdomain_each():

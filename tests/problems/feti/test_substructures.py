@@ -39,9 +39,7 @@ def test_a_solve_projects_out_rigid_motions(
 def test_a_subdomain_without_force_has_no_displacement(parts: LocalProblems) -> None:
     start = parts.torn.domains.start
     b = np.zeros(start[-1])
-    b[start[1] : start[2]] = np.random.default_rng(9).standard_normal(
-        start[2] - start[1]
-    )
+    b[start[1] + 4] = 1.0
     found = parts.solve(b)
     assert found[start[1] : start[2]].any()
     assert not found[: start[1]].any()

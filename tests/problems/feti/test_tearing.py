@@ -24,7 +24,7 @@ from mortarbench.problems.feti.tearing import (
     compact_boxes,
     label_blocks,
 )
-from tests.support.decomposed_bodies import decomposed_pair
+from tests.support.decomposed_bodies import decomposed_pair, parts_of
 from tests.support.glued import decompose, glue, structured_bodies
 
 GLUING = ("orthonormal", "redundant")
@@ -265,6 +265,27 @@ def test_rows_are_those_of_sparse_algebra_on_the_whole_body(rows: str) -> None:
     assert_allclose(torn.f, expected.f, rtol=1e-14)
     assert_allclose(torn.problem.contact_scale, expected.scale, rtol=1e-14)
     assert np.array_equal(pair.domains.class_of, parts.class_of)
+
+
+def test_other_friction_bounds_keep_rows_and_classes() -> None:
+    problem = parts_of("contact-patch/friction=tresca/bound=1e5/feti=2/dual")
+    torn = TornBodies(problem)
+    rows = torn.rows
+    other = torn.with_bound(2 * problem.contact.bound)
+    assert other.rows is rows
+    assert other.domains is torn.domains
+    assert (other.problem.contact.bound == 2 * problem.contact.bound).all()
+
+
+def test_rows_of_a_tangential_vector_have_equal_scales() -> None:
+    """Otherwise, a disc of the multipliers would become an ellipse."""
+    name = "contact-patch/lower=4/upper=3/friction=tresca/bound=1e5/dim=3/distort=0.2"
+    problem = parts_of(f"{name}/feti=2/dual")
+    rows, scale = problem.contact.rows, problem.contact_scale
+    tangents = scale[-problem.contact.bound.size :].reshape(-1, 2)
+    assert (tangents[:, 0] == tangents[:, 1]).all()
+    assert np.unique(tangents).size > 1
+    assert rows.shape[0] == scale.size
 
 
 def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
