@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csr_array, issparse
 
-from mortarbench.harness import InputError, Solution, Status
+from mortarbench.harness import InputError
 from mortarbench.harness.distributed.comm import SERIAL, Lead, led
 from mortarbench.harness.mechanics import Real
 from mortarbench.harness.names import parse
