@@ -41,16 +41,17 @@ from scipy.stats import linregress, t
 from sksparse.cholmod import cholesky
 
 from mortarbench.harness import Mechanics, certify, no_rows
+from mortarbench.harness.distributed.comm import SERIAL, Lead
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.feti_dual import feti_dual
+from mortarbench.problems.duality.feti_dual import TornDual, feti_dual
 from mortarbench.problems.duality.monolithic import primal_qp
-from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.operator_arrays import dual_operator
-from mortarbench.problems.feti.spectrum import spectra_over_ranks
-from mortarbench.problems.feti.subdomains import Contact, on_one_process
+from mortarbench.problems.feti.mechanics import torn_mechanics
+from mortarbench.problems.feti.served import Served
+from mortarbench.problems.feti.spectrum import spectra
+from mortarbench.problems.feti.subdomains import Contact, TornBodies
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 TOL = {"feti": 1e-7, "whole": 1e-8}  #: tolerances for certified errors below 1e-6
@@ -92,14 +93,14 @@ def one(way, family, size, cells):
     rows = problem.linearise(bodies, stage.laws)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
     lap()
-    pieces = subdomains = parts = None
+    served = subdomains = None
     if way == "feti":
         contact = Contact(csr_array(primal.G), primal.h, np.zeros(0))
         layout = of.shape.layout(cells)
         parts = decompose(of, layout, "orthonormal", stage, contact)
-        own = on_one_process(parts)
-        pieces, subdomains = own.decomposed, decomposed_mechanics(own, primal.P)
-        dual = feti_dual(pieces, primal)
+        served = Served(TornBodies(parts))
+        subdomains = torn_mechanics(served, Lead(SERIAL, served), primal.P)
+        dual = feti_dual(served, primal)
     else:
         dual = dualise(primal, factorise_floating(bodies))
     lap()
@@ -126,27 +127,27 @@ def one(way, family, size, cells):
         "total": marks[-1] - marks[0], "cpu": cpu, "peak_mib": int(peak_kib) / 1024,
         **s.counts,
     }  # fmt: skip
-    if parts is None:
+    if served is None:
         return results
-    empty = Contact(no_rows(bodies.mesh.dofs), np.zeros(0), np.zeros(0))
-    unbounded = LocalDual(on_one_process(replace(parts, contact=empty))).share().qp
-    return results | final_face(pieces, unbounded, dual.qp, s)
+    return results | final_face(served, dual.qp, s)
 
 
-def final_face(pieces, unbounded, qp, s):
+def final_face(served, qp, s):
     """Return the quantities of the theory described in the docstring of the module.
 
-    pieces : decomposed bodies
-    unbounded : local QP without contact
+    served : decomposed bodies
     qp, s : dual QP and its solution
     """
-    equality = np.arange(qp.q.size) < pieces.equalities
+    torn, d = served.torn, served.torn.problem.components
+    empty = Contact(no_rows(d * torn.problem.layout.nodes), *np.zeros((2, 0)))
+    alone = Served(torn.with_problem(replace(torn.problem, contact=empty)))
+    unbounded = TornDual(alone, Lead(SERIAL, alone)).qp
+    equality = np.arange(qp.q.size) < torn.rows.equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
-    plain, dirichlet = spectra_over_ranks(
-        unbounded.P, unbounded.A, [None, ("dirichlet", "multiplicity")], tol=1e-3
-    )
+    names = [None, ("dirichlet", "multiplicity")]
+    plain, dirichlet = spectra(unbounded, alone.torn.rows.B, names, tol=1e-3)
     m = int(active.sum())
-    F = dual_operator(pieces.B[active], pieces.domains, pieces.equalities)
+    F = replace(served.operator, B=torn.rows.B[active])
     G = qp.A[:, active]
     coarse = cholesky(csc_matrix(G @ G.T))
 
@@ -157,15 +158,16 @@ def final_face(pieces, unbounded, qp, s):
         return LinearOperator((m, m), lambda v: project(M @ project(v)), dtype=float)
 
     feasible = G.T @ coarse(qp.b)
-    residual = -(qp.q[active] + F @ feasible)
-    M = F.build().preconditioner("dirichlet", "stiffness")
+    residual = -(qp.q[active] + F(feasible))
+    M = F.preconditioner("dirichlet", "stiffness")
+    product = LinearOperator((m, m), F, dtype=float)
     dirichlet_map = LinearOperator((m, m), M, dtype=float)
     identity = LinearOperator((m, m), lambda v: v, dtype=float)
     steps = {}
     for name, of in (("face", dirichlet_map), ("face none", identity)):
         norms = []
         cg(
-            projected(F), projected(identity) @ residual, M=projected(of),
+            projected(product), projected(identity) @ residual, M=projected(of),
             rtol=REDUCTION, callback=norms.append,
         )  # fmt: skip
         steps[name] = len(norms)

@@ -35,7 +35,7 @@ class ThreadComm:
 
     def __init__(self, rank: int, shared: SimpleNamespace) -> None:
         self.rank, self.size, self._shared = rank, shared.barrier.parties, shared
-        self._rounds = 0
+        self._rounds = self._copies = 0
 
     def _exchange(self, value: Any) -> list[Any]:
         self._shared.slots[self.rank] = pickle.dumps(value)
@@ -45,7 +45,9 @@ class ThreadComm:
         return found
 
     def Dup(self) -> ThreadComm:
-        return ThreadComm(self.rank, self._shared.copy)
+        self._copies += 1
+        new = _shared(self.size, self._shared.barriers)
+        return ThreadComm(self.rank, self._shared.copies.setdefault(self._copies, new))
 
     def Reduce(self, part: np.ndarray, total: np.ndarray) -> None:
         parts = self._exchange(part)
@@ -92,20 +94,27 @@ class ThreadComm:
         return SimpleNamespace(Test=test, Wait=wait)
 
     def Abort(self, code: int) -> None:
-        self._shared.barrier.abort()
-        self._shared.copy.barrier.abort()
+        for barrier in self._shared.barriers:
+            barrier.abort()
 
 
-def _shared(size: int, copy: Any = None) -> SimpleNamespace:
+def _shared(size: int, barriers: list[Barrier]) -> SimpleNamespace:
+    """Return what the ranks of a communicator share.
+
+    barriers : barriers of all communicators of these ranks
+    """
+    barriers.append(Barrier(size))
+    if barriers[0].broken:  # a rank has ended all ranks
+        barriers[-1].abort()
     return SimpleNamespace(
-        barrier=Barrier(size), slots=[b""] * size, gathered={}, copy=copy,
-        inboxes=[SimpleQueue() for _ in range(size)],
+        barrier=barriers[-1], barriers=barriers, slots=[b""] * size, gathered={},
+        copies={}, inboxes=[SimpleQueue() for _ in range(size)],
     )  # fmt: skip
 
 
 def on_ranks(size: int, work: Callable[[Comm], T]) -> list[T | BaseException]:
     """Return the results of `work` on all ranks, in order, or their exceptions."""
-    shared = _shared(size, _shared(size))
+    shared = _shared(size, [])
 
     def one(rank: int) -> T | BaseException:
         comm = ThreadComm(rank, shared)

@@ -21,6 +21,9 @@ class Numbers:
     def rank(self):
         return self.comm.rank
 
+    def quotient(self):
+        return 1 // (1 - self.comm.rank)
+
     def failing_on(self, rank):
         if self.comm.rank == rank:
             raise ValueError("no number")
@@ -131,11 +134,20 @@ def test_an_error_of_a_rank_that_serves_ends_all_ranks(monkeypatch, capfd):
     assert "ValueError: no number" in capfd.readouterr().err
 
 
-def test_an_error_of_all_ranks_in_a_service_is_that_of_rank_0():
-    def work(comm):
-        numbers = Numbers(comm, np.zeros(1))
-        with pytest.raises(AttributeError, match="no attribute 'product'"):
-            led(comm, numbers, lambda: Lead(comm, numbers)("product"))
-        return True
+def test_an_error_of_a_call_on_one_rank_is_raised_by_rank_0():
+    """No rank waits for the others in this call; afterwards, rank 0 may call again."""
 
-    assert results_of(2, work) == [True, True]
+    def work(comm):
+        numbers = Numbers(comm, np.full(1, comm.rank))
+
+        def calls():
+            lead = Lead(comm, numbers)
+            with pytest.raises(RankFailedError, match="rank 1 of 2: ZeroDivisionErr"):
+                lead("quotient")
+            with pytest.raises(AttributeError, match="no attribute 'product'"):
+                lead("product")
+            return lead("total", 1.0, 0.0)
+
+        return led(comm, numbers, calls)
+
+    assert results_of(2, work) == [1, 1]

@@ -215,6 +215,83 @@ def test_ranks_assemble_classes_of_their_subdomains_and_share_blocks(
     assert sum(map(len, own)) > condensed  # some class occurs on several ranks
 
 
+def test_implicit_blocks_on_ranks_are_those_of_one_process(monkeypatch):
+    monkeypatch.setattr("mortarbench.problems.feti.operators.MAX_EXPLICIT_MIB", 0)
+    problem = problem_of("beam-ring/Nr=2/Nh=2/steps=1/feti=2/dual")
+
+    def work(comm):
+        served = Served(TornBodies(problem, comm))
+        P, m = operator_of(served, Lead(comm, served)), served.torn.rows.c.size
+        x = np.random.default_rng(6).standard_normal(m)
+
+        def facts():
+            F = P.build()
+            M = F.preconditioner("dirichlet", "stiffness")
+            return {"Fx": P @ x, "diagonal": F.diagonal(), "Mx": M(x)}
+
+        assert not served.operator.explicit.any()
+        return led(comm, served, facts)
+
+    same(results_of(2, work)[0], work(SERIAL))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_no_choice_of_keys_is_another_case_on_ranks(seed):
+    rng = np.random.default_rng(seed)
+    for name in (*generated(rng), *generated(rng)):
+        known = alone(name)
+
+        def work(comm, name=name, s=known["s"]):
+            made = built(name, comm)
+            return led(comm, made.served, lambda: facts(made, comm, s))
+
+        found = results_of(2 + seed % 2, work)[0]
+        assert found["digest"] == known["digest"], name
+        for what in ("operator", "preconditioner", "parts", "dual", "u", "again"):
+            same(found[what], known[what], 1e-7)
+
+
+def generated(rng):
+    """Yield names of small cases with blocks of all shapes and at least three
+    subdomains.
+
+    Cylinders without Q are not included with Coulomb's law: supports fix the central
+    node of both bodies, so that its friction force is not unique.
+    """
+    n = rng.integers(1, 8, size=8)
+    glue = f"glue={rng.choice(['orthonormal', 'redundant'])}"
+    method = f"{glue}/contact={rng.choice(['nts', 'mortar'])}"
+    coulomb = f"/friction=coulomb/mu={rng.choice([0.05, 0.3, 0.6])}"
+    law = rng.choice(["", "/friction=tresca/bound=1e5", coulomb])
+    slave = f"slave={rng.choice(['upper', 'lower'])}"
+    yield (
+        f"beam-ring/Nr={n[0] % 3 + 1}/Nh={n[1] % 4 + 1}/radial={n[2]}/feti={n[3]}/"
+        f"steps={n[4] % 2 + 1}/relin={n[5] % 2 + 1}/{method}{law}"
+    )
+    yield (
+        f"contact-patch/lower={n[4] + 3}/upper={n[5] + 3}/feti={n[6] % 3 + 1}/{slave}/"
+        f"{method}{law}"
+    )
+    yield (
+        f"plate/Sx={n[0] % 3 + 1}/Sy={n[1] % 2 + 3}/n={n[2] % 4 + 1}/ny={n[3] % 4}/"
+        f"pattern={rng.choice(['checkerboard', 'column'])}/jump=100/"
+        f"load={rng.choice(['point', 'edge', 'nodal'])}/{glue}/"
+        f"supports={rng.choice(['rows', 'eliminated'])}"
+    )
+    yield f"membranes/S={n[4] % 3 + 2}/n={n[5] % 4 + 1}/{glue}"
+    yield (
+        f"obstacle/n={n[4] + 6}/shape={rng.choice(['flat', 'hemisphere'])}/"
+        f"feti={n[5] % 3 + 2}/{glue}"
+    )
+    yield f"hertz-plane/n={n[0] % 3 + 1}/feti={n[1] % 4 + 2}/{glue}"
+    yield (
+        f"hertz-cylinder/n=1/m={n[3] % 2 + 1}/feti={n[4] + 8}/{slave}/"
+        f"Q={rng.choice([0.3, 0.7])}/{method}{coulomb}"
+    )
+    yield f"greco/n={n[7] + 4}/mu={rng.choice([0, 0.4, 1])}/feti={n[0] % 3 + 1}"
+
+
 def subdomains(sizes, glued):
     """Return a problem whose subdomains have given numbers of nodes."""
     layout = SimpleNamespace(
