@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 
@@ -75,7 +75,8 @@ class Served:
     def largest_stresses(self, u: Vector) -> Vector:
         """Return the largest stress of each body, (bodies,)."""
         assert self.stresses is not None
-        found = self.torn.comm.gather(self.stresses(u))
+        comm, stresses = self.torn.comm, partial(self.stresses, u)
+        found = comm.gather(comm.together(stresses))
         return np.max(found, axis=0) if found else np.zeros(0)
 
 
