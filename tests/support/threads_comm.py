@@ -35,7 +35,7 @@ class ThreadComm:
 
     def __init__(self, rank: int, shared: SimpleNamespace) -> None:
         self.rank, self.size, self._shared = rank, shared.barrier.parties, shared
-        self._rounds = 0
+        self._rounds = self._copies = 0
 
     def _exchange(self, value: Any) -> list[Any]:
         self._shared.slots[self.rank] = pickle.dumps(value)
@@ -45,12 +45,21 @@ class ThreadComm:
         return found
 
     def Dup(self) -> ThreadComm:
-        return ThreadComm(self.rank, self._shared.copy)
+        self._copies += 1
+        copies, all_of_them = self._shared.copies, self._shared.every
+        new = copies.setdefault(self._copies, _shared(self.size, all_of_them))
+        return ThreadComm(self.rank, new)
 
-    def Reduce(self, part: np.ndarray, total: np.ndarray) -> None:
-        parts = self._exchange(part)
-        if not self.rank:
-            total[...] = sum(parts)
+    def Send(self, part: np.ndarray, dest: int, tag: int) -> None:
+        assert dest == 0
+        self._shared.parts[self.rank].put(part.copy())
+
+    def Recv(self, part: np.ndarray, source: int, tag: int) -> None:
+        while self._shared.parts[source].empty():
+            if self._shared.barrier.broken:
+                raise BrokenBarrierError
+            time.sleep(1e-4)
+        part[...] = self._shared.parts[source].get()
 
     def gather(self, value: Any) -> list[Any] | None:
         found = self._exchange(value)
@@ -92,20 +101,24 @@ class ThreadComm:
         return SimpleNamespace(Test=test, Wait=wait)
 
     def Abort(self, code: int) -> None:
-        self._shared.barrier.abort()
-        self._shared.copy.barrier.abort()
+        for shared in self._shared.every:
+            shared.barrier.abort()
 
 
-def _shared(size: int, copy: Any = None) -> SimpleNamespace:
-    return SimpleNamespace(
-        barrier=Barrier(size), slots=[b""] * size, gathered={}, copy=copy,
+def _shared(size: int, every: list[SimpleNamespace]) -> SimpleNamespace:
+    """Return data that ranks share, and add them to the list of all such data."""
+    shared = SimpleNamespace(
+        barrier=Barrier(size), slots=[b""] * size, gathered={}, copies={}, every=every,
         inboxes=[SimpleQueue() for _ in range(size)],
+        parts=[SimpleQueue() for _ in range(size)],
     )  # fmt: skip
+    every.append(shared)
+    return shared
 
 
 def on_ranks(size: int, work: Callable[[Comm], T]) -> list[T | BaseException]:
     """Return the results of `work` on all ranks, in order, or their exceptions."""
-    shared = _shared(size, _shared(size))
+    shared = _shared(size, [])
 
     def one(rank: int) -> T | BaseException:
         comm = ThreadComm(rank, shared)
