@@ -45,12 +45,14 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.feti_dual import feti_dual
+from mortarbench.problems.duality.feti_dual import TornDual, feti_dual
 from mortarbench.problems.duality.monolithic import primal_qp
-from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.operator_arrays import dual_operator
-from mortarbench.problems.feti.spectrum import spectra_over_ranks
-from mortarbench.problems.feti.subdomains import Contact, on_one_process
+from mortarbench.problems.feti.operators import DualOperator, explicit_classes
+from mortarbench.problems.feti.served import Served
+from mortarbench.problems.feti.spectrum import spectra
+from mortarbench.problems.feti.subdomains import Contact, TornBodies
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 TOL = {"feti": 1e-7, "whole": 1e-8}  #: tolerances for certified errors below 1e-6
@@ -97,8 +99,8 @@ def one(way, family, size, cells):
         contact = Contact(csr_array(primal.G), primal.h, np.zeros(0))
         layout = of.shape.layout(cells)
         parts = decompose(of, layout, "orthonormal", stage, contact)
-        own = on_one_process(parts)
-        pieces, subdomains = own.decomposed, decomposed_mechanics(own, primal.P)
+        pieces = Served(TornBodies(parts))
+        subdomains = torn_mechanics(pieces, primal.P)
         dual = feti_dual(pieces, primal)
     else:
         dual = dualise(primal, factorise_floating(bodies))
@@ -129,24 +131,27 @@ def one(way, family, size, cells):
     if parts is None:
         return results
     empty = Contact(no_rows(bodies.mesh.dofs), np.zeros(0), np.zeros(0))
-    unbounded = LocalDual(on_one_process(replace(parts, contact=empty))).share().qp
+    unbounded = Served(TornBodies(replace(parts, contact=empty)))
     return results | final_face(pieces, unbounded, dual.qp, s)
 
 
 def final_face(pieces, unbounded, qp, s):
     """Return the quantities of the theory described in the docstring of the module.
 
-    pieces : decomposed bodies
-    unbounded : local QP without contact
+    pieces, unbounded : decomposed bodies with and without contact
     qp, s : dual QP and its solution
     """
-    equality = np.arange(qp.q.size) < pieces.equalities
+    (B, _, equalities), domains = pieces.torn.rows, pieces.domains
+    equality = np.arange(qp.q.size) < equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
-    plain, dirichlet = spectra_over_ranks(
-        unbounded.P, unbounded.A, [None, ("dirichlet", "multiplicity")], tol=1e-3
-    )
+    plain, dirichlet = spectra(
+        TornDual(unbounded).qp, unbounded.torn.rows.B,
+        [None, ("dirichlet", "multiplicity")], tol=1e-3,
+    )  # fmt: skip
     m = int(active.sum())
-    F = dual_operator(pieces.B[active], pieces.domains, pieces.equalities)
+    B = B[active]
+    explicit = explicit_classes(B, domains)
+    F = dual_operator(DualOperator(B, domains, explicit, equalities))
     G = qp.A[:, active]
     coarse = cholesky(csc_matrix(G @ G.T))
 

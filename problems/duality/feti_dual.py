@@ -24,7 +24,11 @@ from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.problems.duality.dualisation import Transformed, multiplier_sets
-from mortarbench.problems.feti.operators import block_bytes, touched_components
+from mortarbench.problems.feti.operators import (
+    OperatorOnRanks,
+    block_bytes,
+    touched_components,
+)
 from mortarbench.problems.feti.served import Served, operator_of, parts_of
 from mortarbench.problems.feti.subdomains import TornBodies
 from mortarbench.problems.feti.substructures import LocalProblems, LocalProblemsOnRanks
@@ -32,7 +36,7 @@ from mortarbench.problems.feti.substructures import LocalProblems, LocalProblems
 
 @dataclass(frozen=True, eq=False)
 class TornDual:
-    """The dual of torn bodies on rank 0, which calls methods of all ranks."""
+    """The dual of torn bodies, on rank 0."""
 
     served: Served  #: objects on rank 0
 
@@ -127,9 +131,9 @@ def feti_dual(
 
 
 def digest_of(served: Served, torn: TornBodies, others: int = 0) -> str:
-    """Return a digest of the dual that does not depend on the number of ranks.
+    """Return a digest of the dual that does not depend on the number of processes.
 
-    The rounding of q depends on the number of ranks. Therefore the digest contains the
+    The rounding of q depends on this number. Therefore the digest contains the
     classes of the subdomains, B, c, f and the friction bounds instead. If the dual
     follows from solutions of `others` previous problems, which have rounding errors
     too, it contains the data of the first of these problems and their number.
@@ -143,7 +147,12 @@ def digest_of(served: Served, torn: TornBodies, others: int = 0) -> str:
 
 
 def feti_matrices(served: Served, dual: QP) -> dict[str, Any]:
-    """Return F, d, B, c and R of the dual, keyed by their names in the paper."""
+    """Return F, d, B, c and R of the dual, keyed by their names in the paper.
+
+    If several processes apply F together, it cannot be exported; return {}.
+    """
+    if isinstance(dual.P, OperatorOnRanks):
+        return {}
     B, c, _ = served.torn.rows
     return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": served.domains.kernel()}
 

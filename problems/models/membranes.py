@@ -99,7 +99,7 @@ def decomposed_case(params: Mapping[str, Value], served: Served) -> Case:
         case,
         digest=digest_of(served, served.torn),
         quantities=lambda s: {**case.quantities(s), **sizes},
-        matrices=feti_matrices(served, new.qp) if served.torn.comm.size == 1 else {},
+        matrices=feti_matrices(served, new.qp),
     )
 
 
