@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mortarbench.harness.distributed.comm import Comm, Lead
+    from mortarbench.harness.distributed.comm import Comm
     from mortarbench.harness.mechanics import (
         CellBlock,
         DecomposedMechanics,
@@ -277,9 +277,11 @@ class Case:
 class CaseOnRanks(NamedTuple):
     """A case that several ranks have built together."""
 
-    served: Any  #: objects on this rank whose methods rank 0 calls on all ranks
+    #: object on this rank whose methods rank 0 calls on all ranks by
+    #: ``served.lead(METHOD, …)``; the attribute `lead` is set before `case` is called
+    served: Any
     #: returns the case on rank 0, while the other ranks serve
-    case: Callable[[Lead], Case]
+    case: Callable[[], Case]
 
 
 @dataclass(frozen=True, kw_only=True)

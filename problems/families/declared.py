@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib import import_module
 from inspect import signature
 from types import MappingProxyType
@@ -41,7 +42,8 @@ class DeclaredFamily(Family):
     keys : keys in the order of canonical names
     model : "MODULE.FUNCTION" of `problems.models` that returns the case. The parameters
         of the function may be form, params, reference and individual keys. If the
-        family has subdomains, the function MODULE.on_ranks builds a case on ranks
+        family has subdomains, MODULE.in_subdomains returns the decomposed problem, and
+        MODULE.decomposed_case the case of its dual
     cells : keys that are numbers of cells; refinement doubles the values unless there
         is a key `halvings`
     conditions : mapping from a key to a check that involves several keys; the check
@@ -127,10 +129,14 @@ class DeclaredFamily(Family):
     ) -> CaseOnRanks:
         """Build the dual of decomposed bodies (all ranks call this together)."""
         del reference
-        case: CaseOnRanks = _model(f"{self.model.partition('.')[0]}.on_ranks")(
-            params, comm
-        )
-        return case
+        from mortarbench.harness import CaseOnRanks
+        from mortarbench.problems.feti.served import Served
+        from mortarbench.problems.feti.subdomains import TornBodies
+
+        module = self.model.partition(".")[0]
+        served = Served(TornBodies(_model(f"{module}.in_subdomains")(params), comm))
+        case = _model(f"{module}.decomposed_case")
+        return CaseOnRanks(served, partial(case, params, served))
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

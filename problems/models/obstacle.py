@@ -40,7 +40,6 @@ from scipy.sparse import csc_array, csr_array, eye_array
 from mortarbench.harness import (
     QP,
     Case,
-    CaseOnRanks,
     Grid,
     InputError,
     Mechanics,
@@ -49,7 +48,6 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.harness.distributed.comm import SERIAL, Comm, Lead
 from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import Transformed, dual_bounds, dualise
@@ -99,7 +97,7 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
     start = perf_counter()
     if p["feti"]:
         served = Served(TornBodies(in_subdomains(params)))
-        case = _decomposed(p, served, Lead(SERIAL, served))
+        case = decomposed_case(p, served)
     elif form == "dual":
         case = _case(p, problem, dualise(problem.qp, problem.floating()))
     else:
@@ -107,21 +105,15 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
     return replace(case, dualise_seconds=perf_counter() - start)
 
 
-def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
-    """Build the dual on several ranks; `params` must contain all keys."""
-    served = Served(TornBodies(in_subdomains(params), comm))
-    return CaseOnRanks(served, partial(_decomposed, params, served))
-
-
-def _decomposed(params: Mapping[str, Any], served: Served, lead: Lead) -> Case:
+def decomposed_case(params: Mapping[str, Any], served: Served) -> Case:
     """Return the case of the dual in subdomains on rank 0."""
     problem = obstacle_problem(params["dim"], params["n"], params["shape"])
-    new = feti_dual(served, problem.qp, lead=lead)
-    case = _case(params, problem, new, torn_mechanics(served, lead, problem.qp.P))
+    new = feti_dual(served, problem.qp)
+    case = _case(params, problem, new, torn_mechanics(served, problem.qp.P))
     sizes = decomposition_quantities(served, new.qp)
     return replace(
         case,
-        digest=digest_of(served.torn, lead),
+        digest=digest_of(served, served.torn),
         quantities=lambda s: {**case.quantities(s), **sizes},
     )
 
