@@ -16,9 +16,7 @@ from mortarbench.problems.ranges import (
     check_friction,
     check_kinematics,
     defaults_of,
-    double,
     other_decomposition,
-    refuse_finite_strain,
 )
 
 if TYPE_CHECKING:
@@ -42,8 +40,6 @@ class DeclaredFamily(Family):
     model : "MODULE.FUNCTION" of `problems.models` that returns the case. The parameters
         of the function may be form, params, reference and individual keys. If the
         family has subdomains, the function MODULE.on_ranks builds a case on ranks
-    cells : keys that are numbers of cells; refinement doubles the values unless there
-        is a key `halvings`
     conditions : mapping from a key to a check that involves several keys; the check
         applies if the family declares the key
 
@@ -51,7 +47,6 @@ class DeclaredFamily(Family):
 
     keys: ClassVar[Keys] = MappingProxyType({})
     model: ClassVar[str]
-    cells: ClassVar[tuple[str, ...]] = ()
     conditions: ClassVar[Mapping[str, Callable[[str, Mapping[str, Value]], None]]] = {
         "friction": check_friction,
         "feti": check_decomposition,
@@ -79,24 +74,6 @@ class DeclaredFamily(Family):
     def instead_of(self, key: str) -> str:
         """Return the message for a key that the decomposition excludes, or ""."""
         return other_decomposition(key, self.keys)
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case with half the mesh size.
-
-        Return None if the family declares neither a key `halvings` nor `cells`.
-        Refinement may change the polygons that approximate arcs.
-
-        Raises
-        ------
-        InputError
-            If the strain is finite, see `refuse_finite_strain`.
-
-        """
-        if "kinematics" in params:
-            refuse_finite_strain(self.name, params)
-        if "halvings" in params:
-            return {**params, "halvings": int(params["halvings"]) + 1}
-        return {**params, **double(params, *self.cells)} if self.cells else None
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
         """Return True if bodies are decomposed and kinematics are linear."""

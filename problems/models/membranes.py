@@ -29,7 +29,6 @@ from mortarbench.harness import (
     QP,
     Case,
     CaseOnRanks,
-    Grid,
     Mechanics,
     Solution,
     Value,
@@ -129,12 +128,6 @@ def _case(
             mesh_size=1 / pair.side,
             rigid=pair.rigid,
             names=NAMES,
-            grid=Grid(
-                pair.mesh.points,
-                pair.mesh.cells,
-                pair.body,
-                np.zeros(pair.qp.q.size),
-            ),
             subdomains=subdomains,
         ),
     )

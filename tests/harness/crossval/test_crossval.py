@@ -12,7 +12,6 @@ from mortarbench.cli.main import main
 from mortarbench.harness import QP, Case, Mechanics, Solution, Status, no_rows
 from mortarbench.harness.crossval.assessment import assess, distances, energy_allowed
 from mortarbench.harness.crossval.comparison import brief, compare_answers
-from mortarbench.harness.crossval.discretisation import read_discretisation
 from mortarbench.harness.crossval.ground_truth import StoredAnswer, ground_truth_of
 from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.files.qpfile import qp_digest, save_qp
@@ -85,14 +84,14 @@ def cli(capsys):
     return cli
 
 
-def write_text_alone(directory, data, meshes=()):
+def write_text_alone(directory, data):
     """Write only the Markdown page, without figures."""
     path = directory / "report" / "validation.md"
-    return [write_text(path, markdown(compose(data, meshes)))]
+    return [write_text(path, markdown(compose(data)))]
 
 
-def verdict_on(cli, folder, *more, budget=0):
-    code, out, _ = cli(folder, "--json", "--budget", budget, *more)
+def verdict_on(cli, folder, *more):
+    code, out, _ = cli(folder, "--json", *more)
     return code, json.loads(out)
 
 
@@ -662,7 +661,7 @@ def test_a_file_at_the_path_of_the_page_is_reported_with_the_remedy(
 ):
     folder = write(tmp_path, [("a", f"{BEAM}/primal", truths[2, "primal"][1])])
     (folder / "report").touch()
-    code, _, err = cli(folder, "--budget", 0, validation_page=write_validation)
+    code, _, err = cli(folder, validation_page=write_validation)
 
     assert code == 2
     assert err.splitlines()[-1] == (
@@ -680,9 +679,7 @@ def test_hostile_names_and_huge_numbers_do_not_break_page_or_terminal(
     answers = [("a", f"{BEAM}/primal", s), (name, f"{BEAM}/primal", huge)]
 
     with svg_only():
-        code, out, _ = cli(
-            write(tmp_path, answers), "--budget", 0, validation_page=write_validation
-        )
+        code, out, _ = cli(write(tmp_path, answers), validation_page=write_validation)
 
     def refuse(constant):
         raise AssertionError(constant)
@@ -711,43 +708,13 @@ def test_a_failing_recovery_affects_only_that_answer(duplicate):
     assert "no way back" in found.answers[1].remarks[0]
 
 
-def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path):
-    """For u″ = 2 on a length of 1, ‖u − u_h‖² = h²/3; errors are relative to ‖û‖."""
-    text = "obstacle/dim=1/n=12/primal"
-    case = built(text)
-    folder = write(tmp_path / "out", [("exact", text, reference_solution(case.qp))])
-    _, verdict = verdict_on(cli, folder, budget=300)
-    (found,) = read_discretisation(folder).values()
-    (level, *_) = found.levels
-
-    assert verdict["discretisation"][0]["error"] == found.error
-    assert found.error * level.norm == pytest.approx(0.25 / np.sqrt(3))
-    assert "obstacle/dim=1/n=12: " in cli(folder)[1]
-    cli(folder, validation_page=write_text_alone)
-    page = (folder / "report" / "validation.md").read_text()
-    assert "Errors of the meshes" in page
-    assert "obstacle/dim=1/n=12" in page.partition("Errors of the meshes")[2]
-    again = verdict_on(cli, folder)[1]["discretisation"]
-    assert again[0]["error"] == found.error
-
-
-@pytest.mark.parametrize("budget", ["-1", "nan"])
-def test_an_invalid_time_for_finer_meshes_is_refused(cli, tmp_path, budget):
-    code, _, complaint = cli(tmp_path, "--budget", budget)
-
-    assert code == 2
-    assert "--budget" in complaint
-    assert "expected a number of seconds" in complaint
-    assert budget in complaint
-
-
 def test_the_norm_of_errors_is_stated_and_smalbe_only_if_it_was_measured(
     truths, tmp_path, cli
 ):
     for label, told in (("a", False), ("smalbe", True)):
         answers = [(k, f"{BEAM}/primal", truths[2, "primal"][1]) for k in (label, "b")]
         folder = write(tmp_path / label, answers)
-        _, out, _ = cli(folder, "--budget", "0", validation_page=write_text_alone)
+        _, out, _ = cli(folder, validation_page=write_text_alone)
         page = (folder / "report" / "validation.md").read_text()
 
         assert (
@@ -760,18 +727,3 @@ def test_the_norm_of_errors_is_stated_and_smalbe_only_if_it_was_measured(
 
 def test_small_numbers_have_two_digits_each():
     assert [brief(x) for x in (1.0, 4e-4, 3.17e-9)] == ["1.0e0", "4.0e-4", "3.2e-9"]
-
-
-def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):
-    text = "obstacle/dim=1/n=12/primal"
-    exact = reference_solution(built(text).qp)
-    folder = write(tmp_path / "out", [("exact", text, exact)])
-    with Journal(folder, "there") as journal:
-        old = record_of(text, "old").replace(
-            params={"size": 3}, case="obstacle/size=3/x"
-        )
-        journal.append(old.replace(verdict=Verdict.FAILED))
-
-    assert [
-        d["case"] for d in verdict_on(cli, folder, budget=300)[1]["discretisation"]
-    ] == ["obstacle/dim=1/n=12"]
