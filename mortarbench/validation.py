@@ -134,8 +134,7 @@ def as_text(data: Mapping[str, Any]) -> str:
         for key, words in (
             (
                 "remarks",
-                "answers within their claims, but far less accurate than "
-                "those of other solvers",
+                "remarks on stored points whose claims stand, see the page",
             ),
             ("unanswered", "measurements ended without a claim of success"),
         )

@@ -52,7 +52,7 @@ def compose(data: Data) -> Page:
             ("verdict", "Verdict", _verdict(data)),
             ("disagreements", "Disagreements", _disagreements(data)),
             ("problems", "Problems", _problems(data)),
-            ("remarks", "Outliers", _remarks(data)),
+            ("remarks", "Remarks", _remarks(data)),
             ("left-out", "Not compared", _left_out(data)),
             ("rules", "Rules of the verdict", TEXT.parts("rules")),
         )
@@ -216,28 +216,13 @@ def _problems(data: Data) -> Iterator[Part]:
 
 
 def _remarks(data: Data) -> Iterator[Part]:
-    """Count the answers of each solver that stand out, and tabulate the worst one."""
-    grouped: dict[str, list[Data]] = {}
-    for d in data["remarks"]:
-        grouped.setdefault(d["solver"], []).append(d)
-    if grouped:
-        worst = {
-            s: max(of, key=lambda d: d["error"] or 0.0) for s, of in grouped.items()
-        }
+    """Tabulate anomalies of stored points whose claims stand."""
+    if remarks := data["remarks"]:
         yield Table.of(
-            "Answers within their claims, but far less accurate than the answers of "
-            "other solvers.",
-            grouped,
-            (
-                ("solver", Cell.label),
-                (
-                    "answers",
-                    lambda s: Cell.number(len({d["run_id"] for d in grouped[s]})),
-                ),
-                ("largest error", lambda s: Cell.power(worst[s]["error"])),
-                ("on", lambda s: Cell.words(clean(worst[s]["case"]))),
-                ("remark", lambda s: Cell.words(clean(worst[s]["text"], 200))),
-            ),
+            "Anomalies of stored points whose claims stand.",
+            remarks,
+            (*_CASE, ("remark", lambda d: Cell.words(clean(d["text"], 200)))),
+            text_columns=2,
         )
 
 
