@@ -17,9 +17,7 @@ from mortarbench.problems.ranges import (
     check_friction,
     check_kinematics,
     defaults_of,
-    double,
     other_decomposition,
-    refuse_finite_strain,
 )
 
 if TYPE_CHECKING:
@@ -44,8 +42,6 @@ class DeclaredFamily(Family):
         of the function may be form, params, reference and individual keys. If the
         family has subdomains, MODULE.in_subdomains returns the decomposed problem, and
         MODULE.decomposed_case the case of its dual
-    cells : keys that are numbers of cells; refinement doubles the values unless there
-        is a key `halvings`
     conditions : mapping from a key to a check that involves several keys; the check
         applies if the family declares the key
 
@@ -53,7 +49,6 @@ class DeclaredFamily(Family):
 
     keys: ClassVar[Keys] = MappingProxyType({})
     model: ClassVar[str]
-    cells: ClassVar[tuple[str, ...]] = ()
     conditions: ClassVar[Mapping[str, Callable[[str, Mapping[str, Value]], None]]] = {
         "friction": check_friction,
         "feti": check_decomposition,
@@ -81,24 +76,6 @@ class DeclaredFamily(Family):
     def instead_of(self, key: str) -> str:
         """Return the message for a key that the decomposition excludes, or ""."""
         return other_decomposition(key, self.keys)
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case with half the mesh size.
-
-        Return None if the family declares neither a key `halvings` nor `cells`.
-        Refinement may change the polygons that approximate arcs.
-
-        Raises
-        ------
-        InputError
-            If the strain is finite, see `refuse_finite_strain`.
-
-        """
-        if "kinematics" in params:
-            refuse_finite_strain(self.name, params)
-        if "halvings" in params:
-            return {**params, "halvings": int(params["halvings"]) + 1}
-        return {**params, **double(params, *self.cells)} if self.cells else None
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
         """Return True if bodies are decomposed and kinematics are linear."""

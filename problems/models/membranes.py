@@ -28,7 +28,6 @@ from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 from mortarbench.harness import (
     QP,
     Case,
-    Grid,
     Mechanics,
     Solution,
     Value,
@@ -121,12 +120,6 @@ def _case(
             mesh_size=1 / pair.side,
             rigid=pair.rigid,
             names=NAMES,
-            grid=Grid(
-                pair.mesh.points,
-                pair.mesh.cells,
-                pair.body,
-                np.zeros(pair.qp.q.size),
-            ),
             subdomains=subdomains,
         ),
     )

@@ -34,13 +34,11 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, eye_array
 
 from mortarbench.harness import (
     QP,
     Case,
-    Grid,
     InputError,
     Mechanics,
     Solution,
@@ -124,7 +122,7 @@ def _case(
     new: Transformed,
     subdomains: Callable[[], DecomposedMechanics] | None = None,
 ) -> Case:
-    dim, n, rows = params["dim"], params["n"], problem.qp
+    n, rows = params["n"], problem.qp
     datum = problem.energy(np.zeros(rows.q.size))
     return Case(
         qp=new.qp,
@@ -140,12 +138,6 @@ def _case(
             rigid=np.zeros((rows.q.size, 0)),
             subdomains=subdomains,
             constant=datum,
-            grid=Grid(
-                problem.x,
-                cells(dim, n),
-                np.zeros(problem.cells, dtype=np.int64),
-                problem.lift,
-            ),
         ),
     )
 
@@ -181,8 +173,10 @@ def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
     """Return the decomposed problem of a string; the whole mesh is generated."""
     n = p["n"]
     problem = obstacle_problem(1, n)
-    mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)
-    layout = mesh_in_subdomains(mesh, blocks((n,), p["feti"]), body, np.arange(n + 1))
+    node = np.arange(n + 1)
+    segments = np.stack([node[:-1], node[1:]], axis=-1)
+    mesh, body = Mesh(problem.x, segments, {}), np.zeros(n, dtype=np.int64)
+    layout = mesh_in_subdomains(mesh, blocks((n,), p["feti"]), body, node)
     qp = problem.qp
     return DecomposedProblem(
         layout=layout,
@@ -334,15 +328,6 @@ def nodes(dim: int, n: int, shape: str = "flat") -> Vector:
     x = np.linspace(-HALF[shape], HALF[shape], n + 1)
     grid = np.meshgrid(*[x] * dim, indexing="ij")
     return np.stack([axis.ravel() for axis in grid], axis=-1)
-
-
-def cells(dim: int, n: int) -> NDArray[np.int64]:
-    """Return the corner nodes of each cell, (n, 2) or (n², 4)."""
-    i = np.arange(n)
-    if dim == 1:
-        return np.stack([i, i + 1], axis=-1)
-    first = (i[:, None] * (n + 1) + i).ravel()
-    return np.asarray(first[:, None] + np.array([0, n + 1, n + 2, 1]))
 
 
 def obstacle_height(x: Vector, shape: str) -> Vector:

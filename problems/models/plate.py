@@ -152,10 +152,7 @@ def _case(
             names=("plate",),
             scale=LOAD * LENGTH,
             grid=Grid(
-                mesh.points,
-                mesh.cells,
-                np.zeros(len(mesh.cells), dtype=np.int64),
-                np.zeros(mesh.dofs),
+                mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64)
             ),
             subdomains=subdomains,
         ),

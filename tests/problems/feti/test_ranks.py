@@ -221,7 +221,7 @@ def test_implicit_blocks_on_ranks_are_those_of_one_process(monkeypatch):
 
     def work(comm):
         served = Served(TornBodies(problem, comm))
-        P, m = operator_of(served, Lead(comm, served)), served.torn.rows.c.size
+        P, m = operator_of(served), served.torn.rows.c.size
         x = np.random.default_rng(6).standard_normal(m)
 
         def facts():
