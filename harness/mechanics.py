@@ -604,7 +604,6 @@ class Grid(NamedTuple):
     #: cyclic order, where a triangle repeats its last node; (E, 8) for hexahedra
     cells: NDArray[np.int64]
     bodies: NDArray[np.int64]  #: (E,) body number of each cell
-    lift: Vector  #: (n,) added to u to satisfy nonzero boundary values
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -638,8 +637,8 @@ class Mechanics:
     names: tuple[str, ...] = ()
     scale: float = 1.0  #: energy = scale·(objective of `primal`) + constant
     constant: float = 0.0
-    #: mesh of u, needed to compare solutions on different meshes; see
-    #: `harness.crossval.discretisation`
+    #: mesh of u, from which the size of each body follows; None if u is not a
+    #: displacement of bodies
     grid: Grid | None = None
     friction: Friction = NO_FRICTION
     #: returns the decomposed bodies, for certificates without factorising K

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mortarbench.harness.distributed.comm import Comm, Lead
+    from mortarbench.harness.distributed.comm import Comm
     from mortarbench.harness.mechanics import (
         CellBlock,
         DecomposedMechanics,
@@ -277,9 +277,11 @@ class Case:
 class CaseOnRanks(NamedTuple):
     """A case that several ranks have built together."""
 
-    served: Any  #: objects on this rank whose methods rank 0 calls on all ranks
+    #: object on this rank whose methods rank 0 calls on all ranks by
+    #: ``served.lead(METHOD, …)``; the attribute `lead` is set before `case` is called
+    served: Any
     #: returns the case on rank 0, while the other ranks serve
-    case: Callable[[Lead], Case]
+    case: Callable[[], Case]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,8 +327,6 @@ class Family(ABC):
     defaults: Mapping[str, Value]
     forms: tuple[str, ...]  #: names of the forms of the QP, such as "primal" and "dual"
     path_suffix: str | None = None  #: suffix of the input files; see `harness.names`
-    #: reason why the energy diverges under refinement; empty if it converges
-    singular: str = ""
 
     @abstractmethod
     def build(
@@ -348,22 +348,6 @@ class Family(ABC):
         """Return the key to use instead of a key of other families, or "" if unknown.
 
         The text is the end of the message about an unknown key.
-        """
-        return ""
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the params for half the cell size, or None if unavailable.
-
-        Estimates of the discretisation error need these params, and `Mechanics.grid` of
-        both cases; see `harness.crossval.discretisation`.
-        """
-        return None
-
-    def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Describe the geometry that `refined` does not refine, or return "".
-
-        The text is appended to an estimate of the discretisation error, for instance
-        "of the bodies as they are meshed".
         """
         return ""
 

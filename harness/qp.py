@@ -367,7 +367,7 @@ def _check_finite(name: str, v: Vector) -> None:
 def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ...]:
     """Check the sets, and convert discs of one variable to bounds.
 
-    Sets without variables are omitted, except those of a class with `may_be_empty`.
+    Sets without variables are omitted.
 
     Raises
     ------
@@ -380,7 +380,7 @@ def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ..
     for one in sets[1:]:
         if isinstance(one, Discs) and one.index.shape[1] == 1:
             box = Box(*hull((box, one), n))
-        elif one.block.size or (isinstance(one, Blocks) and one.may_be_empty):
+        elif one.block.size:
             others.append(one)
     return box, *others
 

@@ -10,7 +10,6 @@ from functools import partial
 from html import escape
 from pathlib import Path
 from sys import stderr
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -69,7 +68,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
-    from mortarbench.harness.crossval.discretisation import Discretisation
 
 #: Certified relative error in the energy norm above which `remarks` returns a remark on
 #: a verified answer.
@@ -154,21 +152,6 @@ class Answer:
             "history": history,
             "remarks": [*self.remarks],
         }
-
-    def mesh_error(self, budget: float = 60.0) -> Discretisation:
-        """Estimate the discretisation error, which adds to the error of the solver.
-
-        The reference solver solves the case on finer meshes to obtain this estimate.
-
-        budget : time budget in s; meshes whose solve would exceed it are skipped
-        """
-        from mortarbench.harness.crossval.discretisation import discretisation_errors
-
-        with TemporaryDirectory() as folder:
-            (error,) = discretisation_errors(
-                [self.case.id], self.case.registries.reference, Path(folder), budget
-            )
-        return error
 
     def fields(self) -> Fields:
         """Return the deformed bodies with their stresses and contact forces.
@@ -391,8 +374,6 @@ def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
     if mechanics is None or mechanics.grid is None:
         return
     grid, u = mechanics.grid, case.family_case.recover(solution)
-    if u.size != grid.points.size:
-        return  # u is a scalar field, such as the height of a membrane
     lengths = np.linalg.norm(u.reshape(grid.points.shape), axis=1)
     worst, text = 1.0, ""
     for body in np.unique(grid.bodies):

@@ -121,24 +121,6 @@ def check_scale(scale: float, where: str = "scale") -> float:
     return scale
 
 
-def budget(seconds: float, where: str = "budget") -> float:
-    """Check a time budget in seconds, and return its value.
-
-    where : name of the argument in the error message
-
-    Raises
-    ------
-    InputError
-        If `seconds` is not a number ≥ 0.
-
-    """
-    if not checked.is_number(seconds) or not seconds >= 0:  # `not ≥` also rejects NaN
-        raise InputError(
-            f"{where} = {shown(seconds)}; expected a number of seconds ≥ 0"
-        )
-    return seconds
-
-
 def check_names(
     kind: str, names: Sequence[str], allowed: Sequence[str], where: str
 ) -> None:

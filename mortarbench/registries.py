@@ -29,7 +29,6 @@ from mortarbench.problems import OPERATORS, PROBLEMS
 from mortarbench.solvers import SOLVERS
 
 if TYPE_CHECKING:
-    from mortarbench.harness.crossval.discretisation import Discretisation
     from mortarbench.harness.operators import Maker
     from mortarbench.harness.qp import QP
     from mortarbench.harness.results.work_unit import Commands
@@ -145,17 +144,13 @@ def report_folder(
     return write_report(folder, formats, factor, pool_forms=pool_forms)
 
 
-ValidationPage: TypeAlias = (
-    "Callable[[Path, Mapping[str, Any], Sequence[Discretisation]], list[Path]]"
-)
+ValidationPage: TypeAlias = Callable[[Path, Mapping[str, Any]], list[Path]]
 
 
-def _validation_page(
-    folder: Path, data: Mapping[str, Any], meshes: Sequence[Discretisation]
-) -> list[Path]:
+def _validation_page(folder: Path, data: Mapping[str, Any]) -> list[Path]:
     from mortarbench.reports.validation.report import write_validation
 
-    return write_validation(folder, data, meshes)
+    return write_validation(folder, data)
 
 
 class _FamiliesWithCopies(Mapping[str, Family]):

@@ -80,9 +80,9 @@ def report(
     fail_on : conditions that `Report.failed_on` lists if they are met: ``worse``, a
         verdict became worse; ``slower``, a solver became slower by the criterion in
         docs/statistics-growth.md
-    pool_forms : True to compute means, ranks and profiles over the cases of all forms
-        together, where a declined form counts as unsolved; False to compute them within
-        each form
+    pool_forms : True to compute means, rankings and profiles over the cases of all
+        forms together, where a declined form counts as unsolved; False to compute them
+        within each form
     registries : used instead of the built-in registries, for the function that writes
         the report
 

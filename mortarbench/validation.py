@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from mortarbench.arguments import budget as checked_budget
 from mortarbench.harness import checked
 from mortarbench.harness.conformance import conformance
 from mortarbench.harness.conformance.conformance import (
@@ -21,21 +20,15 @@ from mortarbench.harness.conformance.conformance import (
     Result,
 )
 from mortarbench.harness.crossval.comparison import brief
-from mortarbench.harness.crossval.discretisation import (
-    Discretisation,
-    discretisation_errors,
-)
 from mortarbench.harness.crossval.summary import as_data
 from mortarbench.harness.crossval.validation import validate_folder
 from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.files.durable import replace_file, report_full_disk
-from mortarbench.harness.names import CaseId, assemble
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.measurement import scratch_folder
 from mortarbench.harness.processes.solver_file import write_solver
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.registry import SolverSpec, check_solver, resolve
-from mortarbench.harness.results.journal import read_journal
 from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, load_registries, one_thread
 from mortarbench.text import align, printable
@@ -55,16 +48,14 @@ class Validation:
 
     agreed: bool  #: True if no claim is refuted and no two answers disagree
     data: Mapping[str, Any]  #: contents of validation.json
-    meshes: tuple[Discretisation, ...]  #: discretisation errors, from finer meshes
     pages: tuple[Path, ...]  #: files of the page on the validation
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON, without the details of each problem."""
-        verdict = {k: v for k, v in self.data.items() if k != "problems"}
-        return {**verdict, "discretisation": [asdict(d) for d in self.meshes]}
+        return {k: v for k, v in self.data.items() if k != "problems"}
 
     def __repr__(self) -> str:
-        return as_text(self.data, self.meshes)
+        return as_text(self.data)
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(repr(self))}</pre>"
@@ -74,7 +65,6 @@ class Validation:
 def validate(
     folder: str | Path,
     *,
-    budget: float = 300.0,
     plugins: Plugins = (),
     progress: Callable[[str], None] = ignore,
     registries: Registries | None = None,
@@ -86,7 +76,6 @@ def validate(
     Parameters
     ----------
     folder : result folder, as `run` writes it
-    budget : time in s for solves on finer meshes, which yield discretisation errors
     plugins : Python files with more solvers or families
     progress : called with messages about the progress
     registries : used instead of built-in registries, installed plug-ins and `plugins`
@@ -100,12 +89,11 @@ def validate(
     --------
     >>> import mortarbench as mb
     >>> results = mb.run("smoke", out="out/smoke", cases=["*/dual"], solvers=["pdas"])
-    >>> mb.validate("out/smoke", budget=0).agreed
+    >>> mb.validate("out/smoke").agreed
     True
 
     """
     path = checked.path("folder", folder)
-    checked_budget(budget)
     checked.function("progress", progress)
     registries = load_registries(plugins, registries)
     families = registries.families_with_copies(path)
@@ -118,36 +106,11 @@ def validate(
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
         replace_file(path / "validation.json", text.encode())
-    pages: Sequence[Path] = ()
-    if budget:  # solves on finer meshes are slow, so the page is also written before
-        pages = registries.validation_page(path, data, ())
-    records = {r.case: r for r in read_journal(path, progress)}
-    cases = []
-    for r in records.values():
-        if r.family in families:
-            # `validate_folder` has already listed cases that cannot be assembled, for
-            # example cases of another version, as not validated.
-            with suppress(InputError):
-                case = assemble(families[r.family], r.params, r.form)
-                if r.energy_bound is not None or _refines(case):
-                    cases.append(case)
-    meshes = discretisation_errors(cases, registries.reference, path, budget, progress)
-    if meshes or not budget:
-        pages = registries.validation_page(path, data, meshes)
-    return Validation(
-        agreed=result.agreed, data=data, meshes=tuple(meshes), pages=tuple(pages)
-    )
+    pages = tuple(registries.validation_page(path, data))
+    return Validation(agreed=result.agreed, data=data, pages=pages)
 
 
-def _refines(case: CaseId) -> bool:
-    """Return True if a case has a finer mesh, or its family states why it has none."""
-    try:
-        return case.family.refined(case.params) is not None
-    except InputError:  # its message is the reason; `discretisation_errors` reports it
-        return True
-
-
-def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> str:
+def as_text(data: Mapping[str, Any]) -> str:
     """Return the data of `harness.crossval.summary.as_data` as text for a terminal."""
     parts = [printable(data["headline"]), _solvers(data["solvers"])]
     entries = {
@@ -171,20 +134,13 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
         for key, words in (
             (
                 "remarks",
-                "answers within their claims, but far less accurate than "
-                "those of other solvers",
+                "remarks on stored points whose claims stand, see the page",
             ),
             ("unanswered", "measurements ended without a claim of success"),
         )
         if data["counts"][key]
     ]
     parts += ["; ".join(counts) + "."] if counts else []
-    if meshes:
-        title = (
-            "Relative discretisation errors in the energy norm, which add to the "
-            "certified errors of the solvers; `report` compares both errors"
-        )
-        parts.append(_list(title, [f"{d.case}: {d}" for d in meshes]))
     return "\n\n".join(parts)
 
 

@@ -327,47 +327,6 @@ def check_plane_only(family: str, params: Mapping[str, Value], space: str) -> No
             )
 
 
-def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError if a mesh with friction on arcs is to be refined.
-
-    Refinement changes the polygons that approximate the arcs.
-    """
-    if params["friction"] != "none":
-        raise InputError(
-            f"{family}: friction={params['friction']} forbids the refinement of curved "
-            "sides, because slip depends on the mesh; expected flat sides with "
-            "friction=tresca"
-        )
-
-
-def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError if the discretisation error is requested at finite strain.
-
-    The QP of the next finer mesh is linearised at a different state. The distance
-    between the two solutions is therefore not the discretisation error of either mesh.
-    """
-    if params["kinematics"] == "finite":
-        raise InputError(
-            f"{family}: the discretisation error is not available with "
-            "kinematics=finite; expected kinematics=linear"
-        )
-
-
-def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
-    """Raise InputError if the discretisation error is requested with Coulomb's law.
-
-    The error is measured in the energy norm, and Coulomb's law minimises no energy.
-
-    laws : kinds of the friction laws of all pairs
-    meshes : description of cases to compare instead, for the message
-    """
-    if "coulomb" in laws:
-        raise InputError(
-            f"{family}: friction=coulomb minimises no energy, so that no error in an "
-            f"energy norm exists; compare answers with {meshes}"
-        )
-
-
 def check_tangential(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak.
 
@@ -396,11 +355,6 @@ def one_of(
                 f"{family}: {key}={params[key]!r} is unknown, expected "
                 + " or ".join(map(repr, values))
             )
-
-
-def double(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
-    """Return the `keys`, which are numbers of cells, with doubled values."""
-    return {key: 2 * int(params[key]) for key in keys}
 
 
 def check_dense_memory(family: str, n: int) -> None:

@@ -40,7 +40,7 @@ def write_report(
     Parameters
     ----------
     factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
-    pool_forms : compute means, ranks and profiles over the cases of all forms
+    pool_forms : compute means, rankings and profiles over the cases of all forms
 
     Returns
     -------

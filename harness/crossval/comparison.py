@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from statistics import median
 from typing import NamedTuple
 
 from mortarbench.harness.crossval.assessment import (
@@ -39,12 +38,6 @@ from mortarbench.harness.record import Verdict
 from mortarbench.harness.solution import Status
 from mortarbench.harness.verify.kkt import allowed, verdict
 from mortarbench.harness.verify.verdicts import note_of
-
-#: An answer is an outlier if its error exceeds this multiple of the median error of the
-#: other solvers.
-OUTLIER_RATIO = 100
-#: smallest number of answers of other solvers for which a median is computed
-MIN_PEERS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +64,7 @@ class Answer:
     #: description of a contradiction between the certified bound of the run and the
     #: reference, which indicates a defect of mortarbench; empty without contradiction
     contradiction: str = ""
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  #: anomalies of the stored point
 
     @property
     def error(self) -> float | None:
@@ -164,7 +157,7 @@ def compare_answers(
         truth=truth.name,
         doubt=truth.doubt,
         closed=truth.closed,
-        answers=tuple(_outliers(judged)),
+        answers=tuple(judged),
         pairs=tuple(pairs),
         unresolved=tuple(unresolved),
         note=truth.note,
@@ -194,13 +187,10 @@ def _answer(
         assessment=assessment,
         remarks=g.remarks,
     )
-    refuted = tuple(_refutations(answer))
-    twin = (f"equals its answer to {g.twin}",) if g.twin and refuted else ()
     return replace(
         answer,
-        refuted=refuted,
+        refuted=tuple(_refutations(answer)),
         contradiction=_contradiction(answer),
-        remarks=g.remarks + twin,
     )
 
 
@@ -244,26 +234,6 @@ def _refutations(a: Answer) -> Iterable[str]:
         yield f"{', '.join(off)} in the energy norm, allowed {most}"
     if a.assessment.pulls:
         yield f"inadmissible multipliers at rows {some(map(str, a.assessment.pulls))}"
-
-
-def _outliers(answers: Sequence[Answer]) -> list[Answer]:
-    """Add a remark to valid answers that are far less accurate than other answers."""
-    groups: dict[tuple[str, float], list[tuple[str, float]]] = {}
-    for a in answers:
-        if not a.refuted and a.error is not None:
-            groups.setdefault((a.case, a.tol), []).append((a.solver, a.error))
-    marked = []
-    for a in answers:
-        others = [e for who, e in groups.get((a.case, a.tol), []) if who != a.solver]
-        if a.refuted or a.error is None or len(others) < MIN_PEERS:
-            marked.append(a)
-            continue
-        usual = median(others)
-        if a.error - 2 * (a.doubt or 0.0) > max(OUTLIER_RATIO * usual, a.tol):
-            text = f"error {brief(a.error)}, the median of the others is {brief(usual)}"
-            a = replace(a, remarks=(*a.remarks, text))
-        marked.append(a)
-    return marked
 
 
 def _pairs(

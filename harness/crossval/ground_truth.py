@@ -51,8 +51,6 @@ class StoredAnswer:
     case: Case
     solution: Solution
     remarks: tuple[str, ...] = ()  #: anomalies of the stored point
-    #: another case to which the solver returned exactly the same point, or empty
-    twin: str = ""
 
 
 class GroundTruth(NamedTuple):

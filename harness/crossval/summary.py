@@ -54,9 +54,7 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
     ]
     unresolved = [_apart(p, pair) for p in validation.problems for pair in p.unresolved]
     broken = [_remark(a, a.contradiction) for a in answers if a.contradiction]
-    outliers = [
-        _remark(a, text) for a in answers if not a.refuted for text in a.remarks
-    ]
+    remarks = [_remark(a, text) for a in answers if not a.refuted for text in a.remarks]
     counts = {
         "problems": len(validation.problems),
         "cases": len({a.case for a in answers}),
@@ -66,7 +64,7 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
         "refuted": len(wrong),
         "unresolved": len(unresolved),
         "contradictions": len(broken),
-        "remarks": len(outliers),
+        "remarks": len(remarks),
         "unanswered": len(validation.unanswered),
         "declined": validation.declined,
         "proven_infeasible": validation.proven,
@@ -87,7 +85,7 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
         "disagreements": wrong,
         "unresolved": unresolved,
         "contradictions": broken,
-        "remarks": outliers,
+        "remarks": remarks,
         "unanswered": list(map(asdict, validation.unanswered)),
         "not_validated": list(map(asdict, validation.not_validated)),
         "without_reference": without,

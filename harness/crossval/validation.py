@@ -13,16 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from mortarbench.harness.crossval.comparison import (
-    Answer,
     Problem,
     brief,
     compare_answers,
 )
 from mortarbench.harness.crossval.ground_truth import StoredAnswer
-from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import (
@@ -32,7 +28,6 @@ from mortarbench.harness.files.store import (
     point_arrays,
 )
 from mortarbench.harness.plugin import Case, Family, Reference
-from mortarbench.harness.qp import Vector
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.stored_run import rebuild
@@ -41,8 +36,6 @@ from mortarbench.harness.verify.infeasibility import certificate_of
 from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the file of the stored point was changed after the measurement"
-#: Largest relative difference (Euclidean norm) of contact forces that count as equal.
-MAX_FORCE_DIFFERENCE = 1e-3
 #: Largest error bound of a reference point that refutes a claim of infeasibility.
 MAX_SOLUTION_ERROR = 1e-2
 
@@ -94,8 +87,6 @@ class _Folder:
     path: Path
     families: Mapping[str, Family]
     reference: Reference
-    #: cases to which a solver returned the same point, by label and digest of the point
-    twins: Mapping[tuple[str, str], set[str]]
 
     @property
     def references(self) -> Path:
@@ -108,8 +99,6 @@ class _Part(NamedTuple):
     problems: list[Problem]
     lost: list[Listed]  #: points and claims of infeasibility that were not assessed
     false: list[Listed]  #: false claims without a point
-    suspects: dict[str, Vector]  #: multipliers of refuted answers by run_id
-    truths: dict[str, Vector]  #: multipliers of reference points by name of the problem
     proven: int  #: number of proven claims of infeasibility
 
 
@@ -138,24 +127,15 @@ def validate_folder(
         (r.vectors and is_stored(path, r.vectors)) or _is_proven(r) for r in records
     ):
         raise InputError(f"{path}: {_pointless(records)}")
-    twins: dict[tuple[str, str], set[str]] = {}
-    for r in records:
-        if r.vectors:
-            twins.setdefault((r.solver, r.vectors), set()).add(r.case)
-    folder = _Folder(path=path, families=families, reference=reference, twins=twins)
+    folder = _Folder(path=path, families=families, reference=reference)
     parts: list[_Part] = []
     groups = _groups(records)
     for number, (name, group) in enumerate(groups.items(), 1):
         tell(f"{name} ({number} of {len(groups)})")
         parts.append(_group(folder, name, group))
     false_claims = [claim for part in parts for claim in part.false]
-    refuted = {k: z for part in parts for k, z in part.suspects.items()}
-    truths = {k: z for part in parts for k, z in part.truths.items()}
-    problems = _with_mix_ups(
-        (p for part in parts for p in part.problems), refuted, truths
-    )
     return Validation(
-        problems=tuple(problems),
+        problems=tuple(p for part in parts for p in part.problems),
         solvers=tuple(sorted({r.solver for r in records})),
         false_claims=tuple(false_claims),
         unanswered=tuple(
@@ -207,16 +187,10 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         by_numbers.setdefault(key, []).append(g)
     solve, cache = folder.reference, folder.references
     problems: list[Problem] = []
-    forces: dict[str, Vector] = {}
-    truths: dict[str, Vector] = {}
     for same in by_numbers.values():
         forms = ", ".join(dict.fromkeys(g.record.form for g in same))
         called = name if len(by_numbers) == 1 else f"{name} ({forms})"
-        p = compare_answers(called, same, solve, cache)
-        problems.append(p)
-        forces |= _suspects(p, same)
-        if (exact_forces := _true_forces(p, same, solve, cache)) is not None:
-            truths[p.name] = exact_forces
+        problems.append(compare_answers(called, same, solve, cache))
     proven = [
         p for p in problems if p.doubt is not None and p.doubt < MAX_SOLUTION_ERROR
     ]
@@ -229,7 +203,7 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         if r.identity not in contradictory
         and (text := _falsehood(r, solvable.get(r.case, elastic)))
     ]
-    return _Part(problems, lost, false, forces, truths, len(contradictory))
+    return _Part(problems, lost, false, len(contradictory))
 
 
 def _pointless(records: Sequence[Record]) -> str:
@@ -321,7 +295,6 @@ def _stored_answers(
             case=case,
             solution=s,
             remarks=() if digest_of(point_arrays(s)) == r.vectors else (_CHANGED,),
-            twin=min(folder.twins[r.solver, r.vectors] - {r.case}, default=""),
         )
     return list(answers.values()), lost
 
@@ -355,74 +328,3 @@ def _apart(r: Record) -> Record:
 
 def _listed(r: Record, text: str) -> Listed:
     return Listed(run_id=r.identity, solver=r.solver, case=r.case, tol=r.tol, text=text)
-
-
-def _true_forces(
-    problem: Problem,
-    answers: Sequence[StoredAnswer],
-    solve: Reference,
-    references: Path,
-) -> Vector | None:
-    """Return the multipliers (m,) of the reference point, or None if it is missing."""
-    mechanics = answers[0].case.mechanics
-    if mechanics is None or problem.truth != "reference":
-        return None
-    # the reference point is in the cache
-    point = reference_point(mechanics, solve, references)
-    return np.asarray(point.multipliers, dtype=float)
-
-
-def _suspects(problem: Problem, answers: Sequence[StoredAnswer]) -> dict[str, Vector]:
-    """Return the multipliers of refuted answers by run_id."""
-    refuted = {a.run_id for a in problem.answers if a.refuted and a.assessment}
-    return {
-        g.record.identity: g.case.mechanics.multipliers(
-            g.case.mechanics.to_primal(g.solution)
-        )
-        for g in answers
-        if g.record.identity in refuted and g.case.mechanics is not None
-    }
-
-
-def _with_mix_ups(
-    problems: Iterable[Problem],
-    suspects: Mapping[str, Vector],
-    truths: Mapping[str, Vector],
-) -> list[Problem]:
-    """Add a remark to each refuted answer that solves a different problem.
-
-    suspects : multipliers of refuted answers by run_id
-    truths : multipliers of reference points by name of the problem
-    """
-
-    def remarked(a: Answer, own: str) -> Answer:
-        name = (
-            _nearest_problem(suspects[a.run_id], truths, own)
-            if a.run_id in suspects
-            else ""
-        )
-        if not name:
-            return a
-        text = f"its contact forces equal those of {name}"
-        return replace(a, remarks=(*a.remarks, text))
-
-    return [
-        replace(p, answers=tuple(remarked(a, p.name) for a in p.answers))
-        for p in problems
-    ]
-
-
-def _nearest_problem(z: Vector, truths: Mapping[str, Vector], own: str) -> str:
-    """Return the name of the problem whose contact forces are nearest to z.
-
-    Returns "" if no contact forces equal z up to MAX_FORCE_DIFFERENCE. Also returns ""
-    if the contact forces of the problem `own` equal z: in this case, the answer is
-    wrong for another reason.
-    """
-    differences = {
-        name: float(np.linalg.norm(z - lam) / np.linalg.norm(lam))
-        for name, lam in truths.items()
-        if lam.shape == z.shape and lam.any()
-    }
-    equal = {name: d for name, d in differences.items() if d <= MAX_FORCE_DIFFERENCE}
-    return "" if own in equal else min(equal, key=lambda n: equal[n], default="")

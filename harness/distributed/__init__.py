@@ -1,1 +1,1 @@
-"""Solves on several ranks: communicators, linear maps and sparse factors."""
+"""Communicators of one solve, linear maps and sparse factors."""

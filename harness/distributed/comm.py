@@ -36,6 +36,7 @@ PEER_TIMEOUT = 5.0  #: longest time for which a failed rank waits for the other 
 #: solvers.
 RECORD = "MORTARBENCH_RANK_RECORD"
 _ORDER = 7  #: MPI tag of the orders of rank 0
+_PART = 8  #: MPI tag of the parts of a sum
 #: time after the last order for which a rank waits without sleeping, s; products of one
 #: solve follow each other within this time
 _SPIN_SECONDS = 0.02
@@ -58,7 +59,11 @@ class Comm:
     size = 1  #: number of ranks
 
     def sum(self, part: NDArray[Any]) -> NDArray[Any]:
-        """Return the sum of the arrays of all ranks on rank 0, undefined elsewhere."""
+        """Return the sum of the arrays of all ranks on rank 0, undefined elsewhere.
+
+        The arrays are added in the order of ranks, so that equal arrays have the same
+        sum in every run.
+        """
         return part
 
     def gather(self, part: T) -> list[T]:
@@ -116,8 +121,14 @@ class _MPIComm(Comm):
 
     def sum(self, part: NDArray[Any]) -> NDArray[Any]:
         part = np.ascontiguousarray(part)
-        total = np.empty_like(part)
-        self._comm.Reduce(part, total)
+        if self.rank:
+            self._comm.Send(part, dest=0, tag=_PART)
+            return part
+        # the order of additions in MPI_Reduce may differ from call to call
+        total, received = part.copy(), np.empty_like(part)
+        for rank in range(1, self.size):
+            self._comm.Recv(received, source=rank, tag=_PART)
+            total += received
         return total
 
     def gather(self, part: T) -> list[T]:

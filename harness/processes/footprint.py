@@ -4,7 +4,7 @@ Resident memory (VmRSS) includes shared memory only if a process has mapped and 
 it. A file in /dev/shm, however, occupies memory even if no process has mapped it or the
 process that created it has ended. Each such file is therefore counted once, and it is
 removed when the tree has ended. Libraries that share arrays between processes (joblib,
-multiprocessing, MPI) would otherwise leave these files behind if their processes are
+multiprocessing) would otherwise leave these files behind if their processes are
 killed.
 """
 

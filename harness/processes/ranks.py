@@ -216,14 +216,14 @@ class Host:
         """
         self.comm, self._build, self.limit = comm, build, limit
         self.served: Any = None
-        self._lead = Lead(comm, None)
         self.case: Case | None = None
         self.failure: Exception | None = None
 
     def build(self, case: Mapping[str, Any]) -> None:
         """Build a case together with the other ranks."""
+        if self.served is not None:
+            self.served.lead.served = None  # refuses further calls
         self.served = self.case = self.failure = None  # free memory first
-        self._lead.served = None
         try:
             built = self.comm.together(lambda: self._build(case, self.comm))
         except (InputError, RankFailedError) as e:  # all ranks raise the same error
@@ -238,8 +238,8 @@ class Host:
 
     def finish(self) -> None:
         """Complete the case on rank 0, which calls methods of all ranks."""
-        self._lead = Lead(self.comm, self.served, "served.")
-        self.case = self._case(self._lead)
+        self.served.lead = Lead(self.comm, self.served, "served.")
+        self.case = self._case()
 
     def peaks(self) -> list[float]:
         """Return the peak memory of each rank, in MiB."""

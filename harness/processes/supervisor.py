@@ -124,7 +124,7 @@ class Reply:
     clock: Clock | None = None
     threads: int | None = None  #: number of threads that the worker reported
     cpu: int | None = None  #: number of the CPU to which the worker is bound
-    #: sizes, digest and build time of the QP that ranks built; None if they built
+    #: sizes, digest and build time of the QP that the worker built; None if it built
     #: no QP
     built: Mapping[str, Any] | None = None
 
@@ -156,7 +156,7 @@ class WorkerProcess:
         self._warms_up = True
         self._is_warm = False
         self._is_stopped = self._was_busy = False
-        # True between the steps of a sequence on ranks, whose processes must remain
+        # True between the steps of a sequence that several processes solve
         self._keeps_ranks = False
         # time on the parent's clock and CPU time of the worker at the last answer
         self._idle_since: tuple[float, float] | None = None
@@ -196,7 +196,7 @@ class WorkerProcess:
 
         time_limit : limit in s, counted from the event "start", that is, after imports,
             warm-up and loading of the QP. The same limit applies to the build of the
-            QP by ranks; the limit for their evaluation of the answer is at least
+            QP by the worker; the limit for its evaluation of the answer is at least
             `POINT_SECONDS`
         memory_limit : limit for all processes of the worker together, in MiB
         """
@@ -529,7 +529,7 @@ class WorkerProcess:
         if self._process is None or self._is_stopped:
             return
         if self._keeps_ranks:
-            return  # ranks sleep until the next step
+            return  # its processes sleep until the next step
         if self._others():
             self._kill()  # SIGSTOP would miss processes started after the answer
             return

@@ -54,7 +54,6 @@ _FILE_PREFIXES = (
     "environment.",
     "suite.",
     "validation.",
-    "discretisation.",
 )
 
 

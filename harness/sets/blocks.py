@@ -25,8 +25,6 @@ class Blocks(ABC):
     least: ClassVar[int]  #: smallest number d of variables in a block
     #: text for messages that states the meaning of the columns of `index`
     columns: ClassVar[str]
-    #: True for sets distributed over ranks: a rank without blocks keeps an empty set
-    may_be_empty: ClassVar[bool] = False
 
     index: NDArray[np.int64]  #: (k, d) variables of each block
 

@@ -382,12 +382,6 @@ _COMMANDS = {
                 "displacements of the nodes",
                 {"type": Path},
             ),
-            _Option(
-                "--mesh-error",
-                "",
-                "also estimate the discretisation error by solves on finer meshes (at "
-                "most a minute)",
-            ),
             _PLUGIN,
             _JSON,
         ],
@@ -412,13 +406,6 @@ _COMMANDS = {
         "compare the answers in a result folder with each other and with references",
         [
             _RESULTS,
-            _Option(
-                "--budget",
-                "SECONDS",
-                "time for solves on finer meshes, which yield discretisation errors; "
-                "default: 300",
-                {"default": 300.0},
-            ),
             _PLUGIN,
             _JSON,
         ],

@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from argparse import Namespace
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from mortarbench.arguments import (
@@ -86,18 +86,14 @@ def run(registries: Registries, options: Namespace) -> int:
 
 
 def _print(answer: Answer, options: Namespace) -> None:
-    """Print the answer and, if requested, the discretisation error."""
+    """Print the answer and the table of its convergence."""
     from mortarbench.harness.record import Verdict
 
     record = answer.record
-    mesh = answer.mesh_error() if options.mesh_error else None
     if options.json:
-        data = answer.to_dict() | ({"discretisation": asdict(mesh)} if mesh else {})
-        print(json.dumps(data, allow_nan=False))
+        print(json.dumps(answer.to_dict(), allow_nan=False))
     elif record.verdict is not Verdict.DECLINED:
         print(answer)
-        if mesh is not None:
-            print(f"relative error of the mesh in the energy norm: {mesh}")
         from mortarbench.text import convergence, legend
 
         if table := convergence(answer.history):

@@ -3,7 +3,7 @@
 A load step starts from the solution of its predecessor. Contact is linearised at that
 solution, and `relin` − 1 more times at the solution of the preceding linearisation;
 each linearisation is a `Stage`. The QP of a stage is that of undivided bodies on one
-process (`problems.duality.monolithic`), or of subdomains on MPI ranks
+process (`problems.duality.monolithic`), or of subdomains, on one process or several
 (`problems.duality.decomposed`). The paper uses `relin` = 1, a scheme of first order in
 1/steps.
 

@@ -218,7 +218,6 @@ def contact_case(
                 bodies.mesh.points,
                 bodies.mesh.cells,
                 bodies.pieces[bodies.body],
-                lift,
             ),
             friction=friction,
             # subdomains are certified for supports with u = 0

@@ -26,7 +26,7 @@ from mortarbench.harness import (
     Status,
     Vector,
 )
-from mortarbench.harness.distributed.comm import Comm, Lead, led
+from mortarbench.harness.distributed.comm import Comm, led
 from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.contact.bodies import (
     ContactPair,
@@ -98,7 +98,7 @@ class DecomposedLinearisation:
     @cached_property
     def dual(self) -> TornDual:
         """The dual on rank 0."""
-        return TornDual(self.served, Lead(self.served.torn.comm, self.served))
+        return TornDual(self.served)
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
         """Solve the dual with the given friction bounds."""
@@ -186,10 +186,10 @@ def case_on_ranks(
     first = path.problems(0)[0].problem.served.torn if others else torn
     sides = replace(chosen.problem.sides, friction=chosen.friction)
 
-    def case(lead: Lead) -> Case:
-        dual, elastic = TornDual(served, lead), problem.bodies
+    def case() -> Case:
+        dual, elastic = TornDual(served), problem.bodies
         displacement = lru_cache(maxsize=1)(dual.displacement)
-        mechanics, bound = torn_mechanics(served, lead), sides.friction.bound
+        mechanics, bound = torn_mechanics(served), sides.friction.bound
         acts = np.append(np.ones(sides.c.size), bound) > 0
 
         def quantities(s: Solution) -> Mapping[str, Any]:
@@ -201,7 +201,7 @@ def case_on_ranks(
 
         return Case(
             qp=dual.qp,
-            digest=digest_of(first, lead, others),
+            digest=digest_of(served, first, others),
             recover=lambda s: displacement(s) * elastic.length,
             quantities=quantities,
             certifiable=lambda s: (
@@ -433,7 +433,7 @@ def _quantities(problem: ContactProblem, solution: TornSolution) -> dict[str, An
         supports=dual.torn.problem.fixed.size,
         elements=layout.label.size,
         energy=solution.energy * elastic.force * elastic.length,
-        max_von_mises=dual.lead("largest_stresses", solution.u),
+        max_von_mises=dual.served.lead("largest_stresses", solution.u),
     )
     return {**results_of(bulk, *solution.sides), **problem.results(solution)}
 

@@ -21,11 +21,14 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
 from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.distributed.comm import Lead
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.problems.duality.dualisation import Transformed, multiplier_sets
-from mortarbench.problems.feti.operators import block_bytes, touched_components
+from mortarbench.problems.feti.operators import (
+    OperatorOnRanks,
+    block_bytes,
+    touched_components,
+)
 from mortarbench.problems.feti.served import Served, operator_of, parts_of
 from mortarbench.problems.feti.subdomains import TornBodies
 from mortarbench.problems.feti.substructures import LocalProblems, LocalProblemsOnRanks
@@ -33,10 +36,9 @@ from mortarbench.problems.feti.substructures import LocalProblems, LocalProblems
 
 @dataclass(frozen=True, eq=False)
 class TornDual:
-    """The dual of torn bodies on rank 0, which calls methods of all ranks."""
+    """The dual of torn bodies, on rank 0."""
 
     served: Served  #: objects on rank 0
-    lead: Lead
 
     @property
     def torn(self) -> TornBodies:
@@ -46,18 +48,18 @@ class TornDual:
     @cached_property
     def free(self) -> Vector:
         """K⁺f (N,), the displacement without multipliers."""
-        return np.asarray(self.lead("domains.inverse", self.torn.f))
+        return np.asarray(self.served.lead("domains.inverse", self.torn.f))
 
     @cached_property
     def R(self) -> csr_array:
         """Rigid motions (N, r) of all subdomains."""
-        kernel: csr_array = self.lead("domains.kernel")
+        kernel: csr_array = self.served.lead("domains.kernel")
         return kernel
 
     @cached_property
     def parts(self) -> LocalProblems | LocalProblemsOnRanks:
         """The local problems for certificates."""
-        return parts_of(self.served, self.lead)
+        return parts_of(self.served)
 
     @property
     def sets(self) -> tuple[ConvexSet, ...]:
@@ -73,7 +75,7 @@ class TornDual:
         """The dual QP."""
         B, c, _ = self.torn.rows
         return QP(
-            P=operator_of(self.served, self.lead),
+            P=operator_of(self.served),
             q=c - B @ self.free,
             A=csr_array((B @ self.R).T),
             b=self.R.T @ self.torn.f,
@@ -90,7 +92,7 @@ class TornDual:
         no copy, and u = 0 there.
         """
         B, T, f = self.torn.rows.B, self.torn.spread, self.torn.f
-        v = self.lead("domains.inverse", f - B.T @ s.x) - self.R @ s.y
+        v = self.served.lead("domains.inverse", f - B.T @ s.x) - self.R @ s.y
         squares = csr_array((T.data**2, T.indices, T.indptr), T.shape)
         copies = squares.T @ np.ones(v.size)
         return np.asarray((T.T @ v) / np.maximum(copies, 1))
@@ -102,10 +104,7 @@ class TornDual:
 
 
 def feti_dual(
-    served: Served,
-    primal: QP,
-    friction: Friction = NO_FRICTION,
-    lead: Lead | None = None,
+    served: Served, primal: QP, friction: Friction = NO_FRICTION
 ) -> Transformed:
     """Return the dual of a contact problem on decomposed bodies.
 
@@ -117,10 +116,9 @@ def feti_dual(
         followed by the friction rows
     primal : QP of the undivided bodies
     friction : friction law with a prescribed bound
-    lead : calls methods on all ranks; None on one process
 
     """
-    dual = TornDual(served, lead or Lead(served.torn.comm, served))
+    dual = TornDual(served)
     B_I = contact_rows(primal, friction)[0]
 
     def recover(s: Solution) -> Solution:
@@ -132,24 +130,29 @@ def feti_dual(
     return Transformed(dual.qp, recover, -1.0, constant, dual.displacement)
 
 
-def digest_of(torn: TornBodies, lead: Lead, others: int = 0) -> str:
-    """Return a digest of the dual that does not depend on the number of ranks.
+def digest_of(served: Served, torn: TornBodies, others: int = 0) -> str:
+    """Return a digest of the dual that does not depend on the number of processes.
 
-    The rounding of q depends on the number of ranks. Therefore the digest contains the
+    The rounding of q depends on this number. Therefore the digest contains the
     classes of the subdomains, B, c, f and the friction bounds instead. If the dual
     follows from solutions of `others` previous problems, which have rounding errors
     too, it contains the data of the first of these problems and their number.
 
-    torn : bodies of the first problem
+    torn : bodies of the first problem, in the subdomains of `served`
     """
     (B, c, _), bound = torn.rows, torn.problem.contact.bound
     arrays = (torn.domains.class_of, B.indptr, B.indices, B.data, c, torn.f, bound)
     data = (x.tobytes() for x in arrays)
-    return hex_digest((*lead("domains.names"), *data, str(others).encode()), 16)
+    return hex_digest((*served.lead("domains.names"), *data, str(others).encode()), 16)
 
 
 def feti_matrices(served: Served, dual: QP) -> dict[str, Any]:
-    """Return F, d, B, c and R of the dual, keyed by their names in the paper."""
+    """Return F, d, B, c and R of the dual, keyed by their names in the paper.
+
+    If several processes apply F together, it cannot be exported; return {}.
+    """
+    if isinstance(dual.P, OperatorOnRanks):
+        return {}
     B, c, _ = served.torn.rows
     return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": served.domains.kernel()}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from time import perf_counter
 
-from mortarbench.harness.distributed.comm import SERIAL, Lead
 from mortarbench.harness.mechanics import contact_rows
 from mortarbench.problems.contact.stepping import Iterate
 from mortarbench.problems.duality.decomposed import cached_layout, decompose
@@ -33,7 +32,7 @@ def torn_form(
 ) -> TornForm:
     """Return the dual in subdomains of the problem `chosen` of a load path."""
     served = _torn(problem, choice, path.last_of(choice.step), chosen)
-    lead, primal = Lead(SERIAL, served), chosen.problem.primal
+    primal = chosen.problem.primal
     start = perf_counter()
     dual = feti_dual(served, primal, chosen.friction)
     seconds = perf_counter() - start
@@ -45,9 +44,9 @@ def torn_form(
         seconds=seconds,
         matrices=feti_matrices(served, dual.qp),
         quantities=decomposition_quantities(served, dual.qp),
-        mechanics=torn_mechanics(served, lead, primal.P),
+        mechanics=torn_mechanics(served, primal.P),
         label=served.torn.problem.layout.label,
-        digest=digest_of(first.torn, Lead(SERIAL, first), others),
+        digest=digest_of(served, first.torn, others),
     )
 
 

@@ -21,7 +21,6 @@ from mortarbench.problems.ranges import (
     check_plane_only,
     choice,
     key,
-    refuse_friction,
     schema,
 )
 
@@ -55,9 +54,6 @@ class BeamRing(ContactFamily):
     forms = CONTACT_FORMS
     problem = "beam_ring.problem"
     model = "beam_ring.newton_step"
-    cells = ("Nr", "Nh", "radial", "depth")
-    #: the energy under the point load grows like log(1/h)
-    singular = "the work of a point load grows without bound as the mesh is refined"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return all keys; `radial` defaults to 2·Nh, and `step` to `steps`."""
@@ -84,12 +80,3 @@ class BeamRing(ContactFamily):
                 f"{self.name}: sides={p['sides']} is not used by depth=0; expected no "
                 "sides, or depth=1 or more"
             )
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case with half the mesh size; reject friction.
-
-        The load steps of the refined case are solved on the refined mesh. Friction is
-        not supported, because refinement changes the polygons of the arcs.
-        """
-        refuse_friction(self.name, params)
-        return super().refined(params)

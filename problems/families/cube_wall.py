@@ -25,7 +25,6 @@ class CubeWall(ContactFamily):
     keys = schema(n=key(8, 1), **DECOMPOSITION)
     forms = CONTACT_FORMS
     problem = "solids.cube_wall.problem"
-    cells = ("n",)
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""

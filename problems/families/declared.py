@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib import import_module
 from inspect import signature
 from types import MappingProxyType
@@ -16,9 +17,7 @@ from mortarbench.problems.ranges import (
     check_friction,
     check_kinematics,
     defaults_of,
-    double,
     other_decomposition,
-    refuse_finite_strain,
 )
 
 if TYPE_CHECKING:
@@ -41,9 +40,8 @@ class DeclaredFamily(Family):
     keys : keys in the order of canonical names
     model : "MODULE.FUNCTION" of `problems.models` that returns the case. The parameters
         of the function may be form, params, reference and individual keys. If the
-        family has subdomains, the function MODULE.on_ranks builds a case on ranks
-    cells : keys that are numbers of cells; refinement doubles the values unless there
-        is a key `halvings`
+        family has subdomains, MODULE.in_subdomains returns the decomposed problem, and
+        MODULE.decomposed_case the case of its dual
     conditions : mapping from a key to a check that involves several keys; the check
         applies if the family declares the key
 
@@ -51,7 +49,6 @@ class DeclaredFamily(Family):
 
     keys: ClassVar[Keys] = MappingProxyType({})
     model: ClassVar[str]
-    cells: ClassVar[tuple[str, ...]] = ()
     conditions: ClassVar[Mapping[str, Callable[[str, Mapping[str, Value]], None]]] = {
         "friction": check_friction,
         "feti": check_decomposition,
@@ -79,24 +76,6 @@ class DeclaredFamily(Family):
     def instead_of(self, key: str) -> str:
         """Return the message for a key that the decomposition excludes, or ""."""
         return other_decomposition(key, self.keys)
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case with half the mesh size.
-
-        Return None if the family declares neither a key `halvings` nor `cells`.
-        Refinement may change the polygons that approximate arcs.
-
-        Raises
-        ------
-        InputError
-            If the strain is finite, see `refuse_finite_strain`.
-
-        """
-        if "kinematics" in params:
-            refuse_finite_strain(self.name, params)
-        if "halvings" in params:
-            return {**params, "halvings": int(params["halvings"]) + 1}
-        return {**params, **double(params, *self.cells)} if self.cells else None
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
         """Return True if bodies are decomposed and kinematics are linear."""
@@ -127,10 +106,14 @@ class DeclaredFamily(Family):
     ) -> CaseOnRanks:
         """Build the dual of decomposed bodies (all ranks call this together)."""
         del reference
-        case: CaseOnRanks = _model(f"{self.model.partition('.')[0]}.on_ranks")(
-            params, comm
-        )
-        return case
+        from mortarbench.harness import CaseOnRanks
+        from mortarbench.problems.feti.served import Served
+        from mortarbench.problems.feti.subdomains import TornBodies
+
+        module = self.model.partition(".")[0]
+        served = Served(TornBodies(_model(f"{module}.in_subdomains")(params), comm))
+        case = _model(f"{module}.decomposed_case")
+        return CaseOnRanks(served, partial(case, params, served))
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -25,7 +25,6 @@ from mortarbench.problems.ranges import (
     check_friction,
     check_kinematics,
     key,
-    refuse_coulomb,
     schema,
 )
 
@@ -93,37 +92,6 @@ class GmshBodies(ContactFamily):
             pair_laws(table["contacts"], params)
         mesh = path.parent / table["mesh"]
         check_digest(p["path"], p["sha256"], content_digest(path, mesh))
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case in which every edge of the mesh is bisected."""
-        from mortarbench.problems.models.gmsh_bodies import (
-            is_nearly_incompressible,
-            laws_of,
-        )
-
-        finer = super().refined(params)
-        if is_nearly_incompressible(params):
-            raise InputError(
-                f"{self.name}: the error of the mesh is not estimated if nu exceeds "
-                "0.45; compare halvings=0, 1 and 2 instead"
-            )
-        laws = [law.kind for law in laws_of(params)]
-        refuse_coulomb(self.name, laws, "halvings=0, 1 and 2, or with finer mesh files")
-        return finer
-
-    def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Return a remark if contact sides contain arcs, otherwise an empty string.
-
-        Refinement keeps the chords of arcs, and thus the error of the geometry.
-        """
-        from mortarbench.problems.models.gmsh_bodies import has_arcs
-
-        if not has_arcs(params):
-            return ""
-        return (
-            "of the bodies as they are meshed; corners between chords of an arc "
-            "remain: for pressures, generate a finer mesh"
-        )
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -20,7 +20,6 @@ from mortarbench.problems.ranges import (
     choice,
     key,
     positive,
-    refuse_friction,
     schema,
     size,
 )
@@ -111,8 +110,3 @@ class HertzCylinder(ContactFamily):
                 f"{self.name}: steps={params['steps']} is not used by "
                 f"programme={params['programme']}; expected programme=proportional"
             )
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case with half the mesh size; reject friction."""
-        refuse_friction(self.name, params)
-        return super().refined(params)

@@ -24,7 +24,6 @@ class Membranes(DeclaredFamily):
     keys = schema(S=key(2, 1), n=key(8, 1), **GLUES)
     forms = ("primal", "dual")
     model = "membranes.membranes"
-    cells = ("n",)
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""

@@ -32,7 +32,6 @@ class Obstacle(DeclaredFamily):
     )
     forms = CONTACT_FORMS
     model = "obstacle.obstacle_case"
-    cells = ("n",)
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""

@@ -17,9 +17,7 @@ from mortarbench.problems.ranges import (
     PLANES,
     check_memory,
     choice,
-    double,
     key,
-    refuse_coulomb,
     schema,
     size,
 )
@@ -53,7 +51,6 @@ class ContactPatch(ContactFamily):
     forms = ("primal", "dual")
     problem = "patch.problem"
     model = "patch.newton_step"
-    cells = ("lower", "upper")
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range and is used."""
@@ -80,14 +77,3 @@ class ContactPatch(ContactFamily):
                 f"{self.name}: stretch={stretch:g} must be at least {MIN_STRETCH:g} "
                 "and below 1: stacked blocks can only be compressed"
             )
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case with half the mesh size; reject Coulomb's law.
-
-        A block has ⌈n/2⌉ rows of cells. If n is odd, this number does not double
-        exactly.
-        """
-        finer = double(params, *self.cells)
-        meshes = "/".join(f"{name}={n}" for name, n in finer.items())
-        refuse_coulomb(self.name, [str(params["friction"])], meshes)
-        return super().refined(params)

@@ -45,7 +45,6 @@ class Plate(DeclaredFamily):
     )
     forms = ("primal", "dual")
     model = "plate.clamped_plate"
-    cells = ("n", "ny")
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.sparse import csc_array, csr_array, hstack
 
-from mortarbench.harness.distributed.comm import Lead
 from mortarbench.harness.mechanics import (
     DecomposedMechanics,
     Real,
@@ -26,7 +25,7 @@ from mortarbench.problems.feti.subdomains import DecomposedProblem
 
 
 def torn_mechanics(
-    served: Served, lead: Lead, K: csc_array | None = None
+    served: Served, K: csc_array | None = None
 ) -> Callable[[], DecomposedMechanics]:
     """Return a function that returns the torn bodies on rank 0, for certificates.
 
@@ -35,7 +34,7 @@ def torn_mechanics(
 
     @cache
     def bodies() -> DecomposedMechanics:
-        problem, parts = served.torn.problem, parts_of(served, lead)
+        problem, parts = served.torn.problem, parts_of(served)
         contact, bound = problem.contact, problem.contact.bound
         n, m = problem.components * problem.layout.nodes, contact.c.size
         acts = np.append(np.ones(m - bound.size), bound) > 0

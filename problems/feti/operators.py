@@ -49,7 +49,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.comm import Lead
 from mortarbench.harness.distributed.factor import bordered_factor
 from mortarbench.harness.distributed.sparse import (
     Composition,
@@ -362,40 +361,39 @@ def condensed_groups(
 class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no types
     """The operator F on rank 0; each product is a call of all ranks.
 
-    lead : calls methods of an object on all ranks whose attribute `operator` is a
-        `DualOperator`
+    served : `problems.feti.served.Served` on rank 0
     """
 
-    def __init__(self, lead: Lead, operator: DualOperator) -> None:
-        m = operator.B.shape[0]
+    def __init__(self, served: Any) -> None:
+        m = served.operator.B.shape[0]
         super().__init__(np.dtype(float), (m, m))
-        self._lead = lead
-        self.semidefinite = operator.semidefinite
+        self._served = served
+        self.semidefinite = served.operator.semidefinite
 
     def build(self) -> OperatorOnRanks:
         """Factorise the subdomains on all ranks."""
-        self._lead("operator.prepare")
+        self._served.lead("operator.prepare")
         return self
 
     def forget(self) -> None:
         """Discard all factors; the next product computes them again."""
-        self._lead("forget")
+        self._served.lead("forget")
 
     def diagonal(self) -> Vector:
         """Return the diagonal of F, (m,)."""
-        return np.asarray(self._lead("operator.diagonal"))
+        return np.asarray(self._served.lead("operator.diagonal"))
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
-        outer, _ = self._lead("operator.preconditioner_parts", kind, scaling)
-        inner = partial(self._lead, "operator.precondition", kind, scaling)
+        outer, _ = self._served.lead("operator.preconditioner_parts", kind, scaling)
+        inner = partial(self._served.lead, "operator.precondition", kind, scaling)
         return lambda x: outer(inner(outer(x)))
 
     def _matvec(self, x: Vector) -> Vector:
-        return np.asarray(self._lead("operator", x))
+        return np.asarray(self._served.lead("operator", x))
 
     def _matmat(self, X: Dense) -> Dense:
-        return np.asarray(self._lead("operator", X))
+        return np.asarray(self._served.lead("operator", X))
 
     def _adjoint(self) -> OperatorOnRanks:
         return self

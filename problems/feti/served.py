@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Served:
     """Objects of torn bodies whose methods rank 0 calls on all ranks.
 
     Methods and attributes must be called by all ranks together, and their results are
-    valid on rank 0.
+    valid on rank 0. Rank 0 calls them by `lead`.
     """
 
     torn: TornBodies
@@ -40,6 +40,7 @@ class Served:
     def __post_init__(self) -> None:
         """Let the ranks agree on their subdomains, and compute the rows of B."""
         _ = self.torn.rows
+        self.lead = Lead(self.torn.comm, self)
 
     @property
     def domains(self) -> Subdomains:
@@ -75,19 +76,20 @@ class Served:
     def largest_stresses(self, u: Vector) -> Vector:
         """Return the largest stress of each body, (bodies,)."""
         assert self.stresses is not None
-        found = self.torn.comm.gather(self.stresses(u))
+        comm, stresses = self.torn.comm, partial(self.stresses, u)
+        found = comm.gather(comm.together(stresses))
         return np.max(found, axis=0) if found else np.zeros(0)
 
 
-def operator_of(served: Served, lead: Lead) -> SerialisableOperator | OperatorOnRanks:
+def operator_of(served: Served) -> SerialisableOperator | OperatorOnRanks:
     """Return the dual operator on rank 0; on one process, it can be stored in files."""
     if served.torn.comm.size == 1:
         return dual_operator(served.operator)
-    return OperatorOnRanks(lead, served.operator)
+    return OperatorOnRanks(served)
 
 
-def parts_of(served: Served, lead: Lead) -> LocalProblems | LocalProblemsOnRanks:
+def parts_of(served: Served) -> LocalProblems | LocalProblemsOnRanks:
     """Return the local problems on rank 0."""
     if served.torn.comm.size == 1:
         return served.parts
-    return LocalProblemsOnRanks(lead, served.parts)
+    return LocalProblemsOnRanks(served)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.comm import Lead
 from mortarbench.harness.verify.products import projected_products
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import TornBodies
@@ -108,44 +107,43 @@ class LocalProblems:
 class LocalProblemsOnRanks:
     """Local problems on rank 0; each method is a call of all ranks.
 
-    lead : calls methods of an object on all ranks whose attribute `parts` is a
-        `LocalProblems`
+    served : `problems.feti.served.Served` on rank 0
     """
 
-    lead: Lead
-    parts: LocalProblems
+    served: Any
 
     @property
     def spread(self) -> csr_array:
         """T (N, n), which maps displacements to torn unknowns."""
-        return self.parts.spread
+        spread: csr_array = self.served.parts.spread
+        return spread
 
     @cached_property
     def kernel(self) -> csr_array:
         """R (N, r), a basis of the rigid motions of all subdomains."""
-        kernel: csr_array = self.lead("parts.torn.domains.kernel")
+        kernel: csr_array = self.served.lead("parts.torn.domains.kernel")
         return kernel
 
     @cached_property
     def weight(self) -> Vector:
         """Sum of the diagonal entries of K at the node of each torn unknown, (N,)."""
-        return np.asarray(self.lead("weights"))
+        return np.asarray(self.served.lead("weights"))
 
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
         """Return the diagonal entries of TᵀKT for the columns `at` (k,) of T."""
-        return np.asarray(self.lead("parts.diagonal", at))
+        return np.asarray(self.served.lead("parts.diagonal", at))
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
         """Apply PKP to v (N,) in the precision of v."""
-        return np.asarray(self.lead("parts.product", v))
+        return np.asarray(self.served.lead("parts.product", v))
 
     def squared_product(self, v: Vector) -> Vector:
         """Apply K∘K, the squares of the entries of K, to v (N,)."""
-        return np.asarray(self.lead("parts.squared_product", v))
+        return np.asarray(self.served.lead("parts.squared_product", v))
 
     def solve(self, b: Vector) -> Vector:
         """Apply PK⁺P to b (N,)."""
-        return np.asarray(self.lead("parts.solve", b))
+        return np.asarray(self.served.lead("parts.solve", b))
 
 
 def _nodal(template: SubdomainClass, d: int) -> NDArray[np.float64]:

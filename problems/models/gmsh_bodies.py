@@ -33,7 +33,7 @@ from mortarbench.problems.duality.problem import (
     elastic_bodies_of,
     keyed_linearisation,
 )
-from mortarbench.problems.fem.elasticity import NEARLY_INCOMPRESSIBLE, mean_dilatation
+from mortarbench.problems.fem.elasticity import NEARLY_INCOMPRESSIBLE
 from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
@@ -47,12 +47,6 @@ from mortarbench.problems.models.description import (
     read_description,
 )
 from mortarbench.problems.ranges import check_plane_only
-
-#: largest angle in rad between consecutive edges that count as straight; positive,
-#: because coordinates may be rounded
-MAX_STRAIGHT_ANGLE = 1e-6
-#: largest angle in rad between consecutive chords of an arc; larger angles are corners
-MAX_ARC_ANGLE = np.pi / 4
 
 #: largest overlap of contact sides that causes no remark, relative to the extent of the
 #: smallest body. The chords of touching arcs overlap by up to 5R/n² with n edges per
@@ -294,34 +288,6 @@ def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
     """Return the bodies of a TOML file; `sha256` only distinguishes cached results."""
     del sha256
     return elastic_bodies_of(read_bodies(Path(path), plane, halvings))
-
-
-def is_nearly_incompressible(params: Mapping[str, Value]) -> bool:
-    """Return True if cells of any body have a mean dilatation.
-
-    Interpolated to finer cells, such a displacement has a large energy, so that meshes
-    cannot be compared in the energy norm.
-    """
-    p: Any = params
-    whole = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]).whole
-    return any(mean_dilatation(whole.mesh, whole.elasticity, whole.body))
-
-
-def has_arcs(params: Mapping[str, Value]) -> bool:
-    """Return True if any two consecutive edges of a contact side form an arc.
-
-    Their directions differ by an angle between `MAX_STRAIGHT_ANGLE` and
-    `MAX_ARC_ANGLE`, as for chords of an arc.
-    """
-    p: Any = params
-    elastic = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
-    for side in (chain for pair in elastic.pairs for chain in pair.sides):
-        edges = np.diff(elastic.shape.mesh.points[side], axis=0)
-        angles = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
-        bends = np.abs(np.diff(angles))
-        if ((bends > MAX_STRAIGHT_ANGLE) & (bends < MAX_ARC_ANGLE)).any():
-            return True
-    return False
 
 
 @lru_cache(maxsize=4)

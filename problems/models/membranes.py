@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from time import perf_counter
 from typing import Any
 
@@ -28,14 +28,11 @@ from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 from mortarbench.harness import (
     QP,
     Case,
-    CaseOnRanks,
-    Grid,
     Mechanics,
     Solution,
     Value,
     Vector,
 )
-from mortarbench.harness.distributed.comm import SERIAL, Comm, Lead
 from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.sides import active
 from mortarbench.problems.duality.dualisation import Transformed, primal_form
@@ -80,7 +77,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         return _case(pair, primal_form(pair.qp))
     start = perf_counter()
     served = Served(TornBodies(in_subdomains(params)))
-    case = _decomposed(pair, served, Lead(SERIAL, served))
+    case = decomposed_case(params, served)
     return replace(case, dualise_seconds=perf_counter() - start)
 
 
@@ -90,24 +87,18 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     return Membranes(p["S"], p["n"]).in_subdomains(p["glue"])
 
 
-def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
-    """Build the dual on several ranks; `params` must contain all keys."""
+def decomposed_case(params: Mapping[str, Value], served: Served) -> Case:
+    """Return the case of the dual of decomposed membranes on rank 0."""
     p: Any = params
     pair = Membranes(p["S"], p["n"])
-    served = Served(TornBodies(in_subdomains(params), comm))
-    return CaseOnRanks(served, partial(_decomposed, pair, served))
-
-
-def _decomposed(pair: Membranes, served: Served, lead: Lead) -> Case:
-    """Return the case of the dual of decomposed membranes on rank 0."""
-    new = feti_dual(served, pair.qp, lead=lead)
-    case = _case(pair, new, torn_mechanics(served, lead, pair.qp.P))
+    new = feti_dual(served, pair.qp)
+    case = _case(pair, new, torn_mechanics(served, pair.qp.P))
     sizes = decomposition_quantities(served, new.qp)
     return replace(
         case,
-        digest=digest_of(served.torn, lead),
+        digest=digest_of(served, served.torn),
         quantities=lambda s: {**case.quantities(s), **sizes},
-        matrices=feti_matrices(served, new.qp) if served.torn.comm.size == 1 else {},
+        matrices=feti_matrices(served, new.qp),
     )
 
 
@@ -129,12 +120,6 @@ def _case(
             mesh_size=1 / pair.side,
             rigid=pair.rigid,
             names=NAMES,
-            grid=Grid(
-                pair.mesh.points,
-                pair.mesh.cells,
-                pair.body,
-                np.zeros(pair.qp.q.size),
-            ),
             subdomains=subdomains,
         ),
     )

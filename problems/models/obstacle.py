@@ -34,14 +34,11 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, eye_array
 
 from mortarbench.harness import (
     QP,
     Case,
-    CaseOnRanks,
-    Grid,
     InputError,
     Mechanics,
     Solution,
@@ -49,7 +46,6 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.harness.distributed.comm import SERIAL, Comm, Lead
 from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import Transformed, dual_bounds, dualise
@@ -99,7 +95,7 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
     start = perf_counter()
     if p["feti"]:
         served = Served(TornBodies(in_subdomains(params)))
-        case = _decomposed(p, served, Lead(SERIAL, served))
+        case = decomposed_case(p, served)
     elif form == "dual":
         case = _case(p, problem, dualise(problem.qp, problem.floating()))
     else:
@@ -107,21 +103,15 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
     return replace(case, dualise_seconds=perf_counter() - start)
 
 
-def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
-    """Build the dual on several ranks; `params` must contain all keys."""
-    served = Served(TornBodies(in_subdomains(params), comm))
-    return CaseOnRanks(served, partial(_decomposed, params, served))
-
-
-def _decomposed(params: Mapping[str, Any], served: Served, lead: Lead) -> Case:
+def decomposed_case(params: Mapping[str, Any], served: Served) -> Case:
     """Return the case of the dual in subdomains on rank 0."""
     problem = obstacle_problem(params["dim"], params["n"], params["shape"])
-    new = feti_dual(served, problem.qp, lead=lead)
-    case = _case(params, problem, new, torn_mechanics(served, lead, problem.qp.P))
+    new = feti_dual(served, problem.qp)
+    case = _case(params, problem, new, torn_mechanics(served, problem.qp.P))
     sizes = decomposition_quantities(served, new.qp)
     return replace(
         case,
-        digest=digest_of(served.torn, lead),
+        digest=digest_of(served, served.torn),
         quantities=lambda s: {**case.quantities(s), **sizes},
     )
 
@@ -132,7 +122,7 @@ def _case(
     new: Transformed,
     subdomains: Callable[[], DecomposedMechanics] | None = None,
 ) -> Case:
-    dim, n, rows = params["dim"], params["n"], problem.qp
+    n, rows = params["n"], problem.qp
     datum = problem.energy(np.zeros(rows.q.size))
     return Case(
         qp=new.qp,
@@ -148,12 +138,6 @@ def _case(
             rigid=np.zeros((rows.q.size, 0)),
             subdomains=subdomains,
             constant=datum,
-            grid=Grid(
-                problem.x,
-                cells(dim, n),
-                np.zeros(problem.cells, dtype=np.int64),
-                problem.lift,
-            ),
         ),
     )
 
@@ -189,8 +173,10 @@ def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
     """Return the decomposed problem of a string; the whole mesh is generated."""
     n = p["n"]
     problem = obstacle_problem(1, n)
-    mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)
-    layout = mesh_in_subdomains(mesh, blocks((n,), p["feti"]), body, np.arange(n + 1))
+    node = np.arange(n + 1)
+    segments = np.stack([node[:-1], node[1:]], axis=-1)
+    mesh, body = Mesh(problem.x, segments, {}), np.zeros(n, dtype=np.int64)
+    layout = mesh_in_subdomains(mesh, blocks((n,), p["feti"]), body, node)
     qp = problem.qp
     return DecomposedProblem(
         layout=layout,
@@ -342,15 +328,6 @@ def nodes(dim: int, n: int, shape: str = "flat") -> Vector:
     x = np.linspace(-HALF[shape], HALF[shape], n + 1)
     grid = np.meshgrid(*[x] * dim, indexing="ij")
     return np.stack([axis.ravel() for axis in grid], axis=-1)
-
-
-def cells(dim: int, n: int) -> NDArray[np.int64]:
-    """Return the corner nodes of each cell, (n, 2) or (n², 4)."""
-    i = np.arange(n)
-    if dim == 1:
-        return np.stack([i, i + 1], axis=-1)
-    first = (i[:, None] * (n + 1) + i).ravel()
-    return np.asarray(first[:, None] + np.array([0, n + 1, n + 2, 1]))
 
 
 def obstacle_height(x: Vector, shape: str) -> Vector:

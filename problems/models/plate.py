@@ -34,7 +34,6 @@ from scipy.sparse import csr_array, eye_array
 from mortarbench.harness import (
     QP,
     Case,
-    CaseOnRanks,
     Fields,
     Grid,
     Mechanics,
@@ -43,7 +42,6 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.harness.distributed.comm import SERIAL, Comm, Lead
 from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.stepping import Forces
 from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
@@ -104,31 +102,25 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
     """Return the case in the form `form`."""
     if form == "dual":
         served = Served(TornBodies(in_subdomains(params)))
-        return _decomposed(params, served, Lead(SERIAL, served))
+        return decomposed_case(params, served)
     plate = model(tuple(params.items()))
     return _case(plate, primal_form(plate.primal))
 
 
-def on_ranks(params: Mapping[str, Value], comm: Comm) -> CaseOnRanks:
-    """Build the dual on several ranks; `params` must contain all keys."""
-    served = Served(TornBodies(in_subdomains(params), comm))
-    return CaseOnRanks(served, partial(_decomposed, params, served))
-
-
-def _decomposed(params: Mapping[str, Value], served: Served, lead: Lead) -> Case:
+def decomposed_case(params: Mapping[str, Value], served: Served) -> Case:
     """Return the case of the dual in subdomains on rank 0."""
     plate = model(tuple(params.items()))
-    new = feti_dual(served, plate.primal, lead=lead)
-    case = _case(plate, new, torn_mechanics(served, lead, plate.primal.P))
+    new = feti_dual(served, plate.primal)
+    case = _case(plate, new, torn_mechanics(served, plate.primal.P))
     conditions = cache(
         lambda: dual_quantities(plate.moduli, new.qp, served.torn.rows.B)
     )
     sizes = decomposition_quantities(served, new.qp)
     return replace(
         case,
-        digest=digest_of(served.torn, lead),
+        digest=digest_of(served, served.torn),
         quantities=lambda s: {**case.quantities(s), **conditions(), **sizes},
-        matrices=feti_matrices(served, new.qp) if served.torn.comm.size == 1 else {},
+        matrices=feti_matrices(served, new.qp),
     )
 
 
@@ -160,10 +152,7 @@ def _case(
             names=("plate",),
             scale=LOAD * LENGTH,
             grid=Grid(
-                mesh.points,
-                mesh.cells,
-                np.zeros(len(mesh.cells), dtype=np.int64),
-                np.zeros(mesh.dofs),
+                mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64)
             ),
             subdomains=subdomains,
         ),

@@ -143,10 +143,10 @@ class Ranking:
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:
-        """Intervals of ranks that significant differences between solvers allow.
+        """Intervals of the ranking that significant differences between solvers allow.
 
-        A solver ranks after all significantly faster solvers and before all
-        significantly slower ones. The intervals contain all true ranks jointly with
+        A solver comes after all significantly faster solvers and before all
+        significantly slower ones. The intervals contain the true ranking jointly with
         95 % confidence [1]_.
 
         References
@@ -188,7 +188,8 @@ def ranking_of(group: ComparisonGroup) -> Ranking:
 class Changed(NamedTuple):
     """Ranks under another convention."""
 
-    ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
+    #: (solvers,) from 1, equal means have equal numbers; NaN: not compared
+    ranking: Array
     #: (solvers, solvers) True if the order of the row and column solvers is reversed
     turned: NDArray[np.bool_]
 
@@ -213,16 +214,16 @@ def panel(group: ComparisonGroup) -> Panel:
 
     def changed(convention: Convention) -> Changed:
         means = geometric_means(group, convention)
-        return Changed(ranks(means), order_of(usual) * order_of(means) < 0)
+        return Changed(rank_of(means), order_of(usual) * order_of(means) < 0)
 
     return Panel(
-        usual=ranks(usual),
+        usual=rank_of(usual),
         single={name: changed(convention) for name, convention in SINGLE.items()},
         every=tuple(map(changed, EVERY)),
     )
 
 
-def ranks(means: Array) -> Array:
+def rank_of(means: Array) -> Array:
     """Rank means from 1; means that are equal up to rounding share the smaller rank."""
     ahead = (order_of(means) > 0).sum(axis=1)  # number of solvers with smaller means
     return np.where(np.isnan(means), np.nan, 1.0 + ahead)

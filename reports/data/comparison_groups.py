@@ -1,4 +1,4 @@
-"""Times of all solvers on all cases of a group, for means, ranks and profiles."""
+"""Times of all solvers on all cases of a group, for means, rankings and profiles."""
 
 from __future__ import annotations
 

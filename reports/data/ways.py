@@ -109,6 +109,6 @@ def _has_all_times(r: Record) -> bool:
     """Return whether a record contains the time of dualisation or does not need it.
 
     Primal forms and records without a total time do not need it. Journals of older
-    versions and cases built by ranks lack it.
+    versions and cases built by several processes lack it.
     """
     return r.form == PRIMAL or r.total_seconds is None or r.dualise_seconds is not None

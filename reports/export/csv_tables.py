@@ -16,8 +16,8 @@ from mortarbench.reports.data.aggregation import (
     USUAL,
     Convention,
     Ranking,
+    rank_of,
     ranking_of,
-    ranks,
 )
 from mortarbench.reports.data.aggregation import geometric_means as means_by
 from mortarbench.reports.data.comparison_groups import (
@@ -194,7 +194,7 @@ def _means(ranking: Ranking) -> list[dict[str, Any]]:
     rows = []
     for convention in (*EVERY, Convention(common=True)):
         means = means_by(group, convention)
-        columns = {"mean": means, "rank": ranks(means)}
+        columns = {"mean": means, "rank": rank_of(means)}
         columns |= usual if convention == USUAL else {}
         rows += [
             {"contest": group.title, "solver": solver}

@@ -23,8 +23,6 @@ from mortarbench.reports.document.figure import (
     in_rows,
 )
 from mortarbench.reports.figures.style import (
-    DASHED,
-    DOTTED,
     LEGEND_LINE,
     TITLE,
     curve,
@@ -35,13 +33,10 @@ from mortarbench.reports.figures.style import (
     with_legend,
 )
 
-SHARE = 0.1  #: largest sufficient solver error, relative to the discretisation error
 CROWDED = 1000  #: number of markers above which markers are smaller and paler
 _COLUMNS = 4  #: number of columns of the legend
 _LEAST = 1e-17  #: smaller residuals, including zero, are drawn at this value
 _LEAST_RATIO = 1e-10  #: smaller ratios of residual to tolerance are drawn at this value
-_MESH = Look(colour=INK, width=0.8, dash=DASHED)
-_TENTH = Look(colour=INK, width=0.8, dash=DOTTED)
 _BARS = {"cap": 1.5, "width": 0.6, "opacity": 0.55}
 
 Sweep = Mapping[str, Sequence[Outcome]]  #: answers by solver, in order of tolerance
@@ -106,7 +101,7 @@ def sweep_figure(swept: Sequence[tuple[str, Sweep]], solvers: Sequence[str]) -> 
 
 
 def _panel(
-    case: str, error: str, marks: Sequence[Series], rules: Sequence[Rule]
+    case: str, error: str, marks: Sequence[Series], rules: Sequence[Rule] = ()
 ) -> Panel:
     return Panel(
         x=log("median total time in s"),
@@ -133,32 +128,19 @@ def _residuals(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
 
 
 def certified_figure(
-    swept: Sequence[tuple[str, Sweep]],
-    solvers: Sequence[str],
-    meshes: Mapping[str, float],
+    swept: Sequence[tuple[str, Sweep]], solvers: Sequence[str]
 ) -> Figure:
     """Plot the certified error against time, with a panel for each (case, sweep).
 
     solvers : all solvers of the report, whose order determines colours and markers
-    meshes : physical case → its discretisation error, if available
     """
-    panels, lines = [], []
+    panels = []
     for case, row in swept:
-        marks, rules = list[Series](), list[Rule]()
+        marks = list[Series]()
         for solver in (s for s in solvers if s in row):
             marks += _certified(row[solver], look(solvers.index(solver)))
-        error = meshes.get(next(iter(row.values()))[0].physical)
-        if error is not None:
-            lines = [
-                ("discretisation error", _MESH),
-                ("a tenth of the discretisation error", _TENTH),
-            ]
-            rules = [
-                Rule(axis="y", at=error, look=_MESH),
-                Rule(axis="y", at=SHARE * error, look=_TENTH),
-            ]
-        panels.append(_panel(case, "certified relative error", marks, rules))
-    return _figure(panels, swept, solvers, lines)
+        panels.append(_panel(case, "certified relative error", marks))
+    return _figure(panels, swept, solvers)
 
 
 def _certified(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
@@ -181,10 +163,10 @@ def _figure(
     panels: Sequence[Panel],
     swept: Sequence[tuple[str, Sweep]],
     solvers: Sequence[str],
-    lines: Sequence[tuple[str, Look]] = (),
 ) -> Figure:
-    """Arrange panels in two columns above a legend of solvers and reference lines."""
+    """Arrange panels in two columns above a legend of solvers."""
     present = [s for s in solvers if any(s in row for _, row in swept)]
-    keys = [*solver_keys(present, solvers), *(Key(label=s, look=l) for s, l in lines)]
     rows = in_rows(panels, min(len(panels), 2))
-    return with_legend(rows, keys, _COLUMNS, 0.3 + 2.6 * len(rows))
+    return with_legend(
+        rows, solver_keys(present, solvers), _COLUMNS, 0.3 + 2.6 * len(rows)
+    )

@@ -30,7 +30,8 @@ from mortarbench.reports.document.layout import Part, Section
 class Analysis:
     """Evidence from one environment, and derived results that several sections use.
 
-    pool_forms : compute means, ranks and profiles over the cases of all forms together
+    pool_forms : compute means, rankings and profiles over the cases of all forms
+        together
     """
 
     def __init__(self, evidence: Evidence, *, pool_forms: bool = False) -> None:
@@ -54,7 +55,7 @@ class Analysis:
 
     @property
     def groups(self) -> tuple[ComparisonGroup, ...]:
-        """Groups of cases over which means, ranks and profiles are computed."""
+        """Groups of cases over which means, rankings and profiles are computed."""
         return self.pooled if self.pool_forms else self.forms
 
     @cached_property

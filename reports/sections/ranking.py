@@ -1,4 +1,4 @@
-"""Times over cases: means, ranks under several conventions, and profiles."""
+"""Times over cases: means, rankings under several conventions, and profiles."""
 
 from __future__ import annotations
 
@@ -159,9 +159,9 @@ def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
     return Cell.ratio(ratio, after=f"n = {ratio.pairs}{session}")
 
 
-@section(42, "ranking", "Dependence of the ranks on conventions")
+@section(42, "ranking", "Dependence of the ranking on conventions")
 def ranking(a: Analysis) -> Iterator[Part]:
-    """Tabulate the ranks of every ranked group under changed conventions."""
+    """Tabulate the ranking of every ranked group under changed conventions."""
     if a.rankings:
         yield from TEXT.parts("ranking")
     yield from not_compared(a)
@@ -178,16 +178,16 @@ def ranking(a: Analysis) -> Iterator[Part]:
 
 def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
     def changed(one: Changed, i: int) -> Cell:
-        if np.isnan(one.ranks[i]):
+        if np.isnan(one.ranking[i]):
             return Cell(title="not part of this comparison")
         return Cell.number(
-            float(one.ranks[i]),
+            float(one.ranking[i]),
             "{:.0f}".format,
             kind="over" if one.turned[i].any() else "",
         )
 
     def every(i: int) -> Cell:
-        found = [int(one.ranks[i]) for one in ranked.every]
+        found = [int(one.ranking[i]) for one in ranked.every]
         return _range(min(found), max(found))
 
     def reading(i: int) -> Cell:

@@ -7,10 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mortarbench.harness import Verdict
-from mortarbench.harness.crossval.discretisation import (
-    Discretisation,
-    read_discretisation,
-)
 from mortarbench.reports.data.cells import solver_columns, source
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.data.time_at_accuracy import (
@@ -58,8 +54,7 @@ def accuracy(a: Analysis) -> Iterator[Part]:
     if certified := certified_sweeps(a.evidence):
         yield from TEXT.parts("certified")
         yield time_at_accuracy_table(certified, solvers)
-        meshes = read_discretisation(a.evidence.directory)
-        yield certified_picture(certified, solvers, meshes)
+        yield certified_picture(certified, solvers)
     judged = [o for o in a.evidence.flat if o.first.accuracy is not None]
     swept = by_solver(judged, lambda o: (o.case, o.first.judged_at))
     swept = dict(sorted(swept.items()))
@@ -219,19 +214,10 @@ def _matched(found: TimeAtAccuracy, tried: Sequence[Outcome], kind: str) -> Cell
     )
 
 
-def certified_picture(
-    swept: Sweeps, solvers: Sequence[str], meshes: Mapping[str, Discretisation]
-) -> Picture:
+def certified_picture(swept: Sweeps, solvers: Sequence[str]) -> Picture:
     """Draw certified error against time for the first few cases."""
-    drawn = [*swept.items()][:_PANELS]
-    errors = {
-        physical: mesh.error
-        for physical, mesh in meshes.items()
-        if mesh.kind in ("limit", "change") and mesh.error
-    }
-    lines = any(next(iter(row.values()))[0].physical in errors for _, row in drawn)
     return Picture(
         name="certified",
-        caption=TEXT("certified_caption", len(swept), _PANELS, lines),
-        figure=certified_figure(drawn, solvers, errors),
+        caption=TEXT("certified_caption", len(swept), _PANELS),
+        figure=certified_figure([*swept.items()][:_PANELS], solvers),
     )

@@ -67,7 +67,7 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
     difference d of their logarithms is random. In each flip, the signs of some cases
     are reversed for all pairs. The statistic of a pair is compared with the maxima over
     all pairs in the flips [3]_. There are two statistics: Σd/√Σd², which is equivalent
-    to Student's t, and the same expression for the signed ranks of d, which a few
+    to Student's t, and the same expression for the signed rank of d, which a few
     failures with a large penalty do not distort. A statistic is used only if it has the
     sign of the mean. The more significant of the two statistics is used, for the data
     and for every flip. Therefore, for any number of equal solvers, the probability that
@@ -145,12 +145,12 @@ def _flipped(scores: Array, signs: Array) -> tuple[Array, Array]:
 
 def _ranks(values: Array) -> Array:
     """Rank each column of (cases, pairs) values; equal values share the mean rank."""
-    ranks = np.empty_like(values)
-    for column, rank in zip(values.T, ranks.T, strict=True):
+    ranking = np.empty_like(values)
+    for column, rank in zip(values.T, ranking.T, strict=True):
         order = np.sort(column)
         below, within = (order.searchsorted(column, side) for side in ("left", "right"))
         rank[:] = (below + within + 1) / 2
-    return ranks
+    return ranking
 
 
 def _p_values(values: Array, by: Array) -> Array:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness import Verdict
-from mortarbench.harness.crossval.discretisation import Discretisation
 from mortarbench.reports.document.formatting import (
     ABSENT,
     VERDICTS,
@@ -35,14 +34,9 @@ Data = Mapping[str, Any]
 TEXT = Sentences(__name__)
 
 
-def write_validation(
-    directory: Path, data: Data, meshes: Sequence[Discretisation] = ()
-) -> list[Path]:
-    """Write report/validation.html and .md in `directory` from the data of `validate`.
-
-    meshes : discretisation errors, for cases solved on finer meshes
-    """
-    page, target = compose(data, meshes), directory / "report"
+def write_validation(directory: Path, data: Data) -> list[Path]:
+    """Write report/validation.html and .md from the data of `validate`."""
+    page, target = compose(data), directory / "report"
     _, drawings = write_figures(page, target)
     return [
         write_text(target / "validation.html", html(page, drawings)),
@@ -50,7 +44,7 @@ def write_validation(
     ]
 
 
-def compose(data: Data, meshes: Sequence[Discretisation] = ()) -> Page:
+def compose(data: Data) -> Page:
     """Compose the page, beginning with the verdict."""
     sections = (
         Section.of(*each)
@@ -58,8 +52,7 @@ def compose(data: Data, meshes: Sequence[Discretisation] = ()) -> Page:
             ("verdict", "Verdict", _verdict(data)),
             ("disagreements", "Disagreements", _disagreements(data)),
             ("problems", "Problems", _problems(data)),
-            ("remarks", "Outliers", _remarks(data)),
-            ("discretisation", "Errors of the meshes", _discretisation(meshes)),
+            ("remarks", "Remarks", _remarks(data)),
             ("left-out", "Not compared", _left_out(data)),
             ("rules", "Rules of the verdict", TEXT.parts("rules")),
         )
@@ -223,76 +216,14 @@ def _problems(data: Data) -> Iterator[Part]:
 
 
 def _remarks(data: Data) -> Iterator[Part]:
-    """Count the answers of each solver that stand out, and tabulate the worst one."""
-    grouped: dict[str, list[Data]] = {}
-    for d in data["remarks"]:
-        grouped.setdefault(d["solver"], []).append(d)
-    if grouped:
-        worst = {
-            s: max(of, key=lambda d: d["error"] or 0.0) for s, of in grouped.items()
-        }
+    """Tabulate anomalies of stored points whose claims stand."""
+    if remarks := data["remarks"]:
         yield Table.of(
-            "Answers within their claims, but far less accurate than the answers of "
-            "other solvers.",
-            grouped,
-            (
-                ("solver", Cell.label),
-                (
-                    "answers",
-                    lambda s: Cell.number(len({d["run_id"] for d in grouped[s]})),
-                ),
-                ("largest error", lambda s: Cell.power(worst[s]["error"])),
-                ("on", lambda s: Cell.words(clean(worst[s]["case"]))),
-                ("remark", lambda s: Cell.words(clean(worst[s]["text"], 200))),
-            ),
+            "Anomalies of stored points whose claims stand.",
+            remarks,
+            (*_CASE, ("remark", lambda d: Cell.words(clean(d["text"], 200)))),
+            text_columns=2,
         )
-
-
-def _discretisation(meshes: Sequence[Discretisation]) -> Iterator[Part]:
-    """Tabulate discretisation errors, which add to the certified errors."""
-    if meshes:
-        yield TEXT("discretisation")
-        yield mesh_table(meshes)
-
-
-def mesh_table(meshes: Sequence[Discretisation]) -> Table:
-    """Tabulate the error of every mesh, or the reason why it is unknown."""
-
-    def unknowns(d: Discretisation, level: int) -> Cell:
-        known = len(d.levels) > level
-        return Cell.number(d.levels[-1 if level else 0].unknowns if known else None)
-
-    def error(d: Discretisation) -> Cell:
-        less = "< " if d.kind == "rounding" else ""
-        return Cell(text=less + power(d.error) if d.error else ABSENT, value=d.error)
-
-    def note(d: Discretisation) -> Cell:
-        text = {
-            "limit": "; ".join(
-                filter(None, ["relative to the limit of fine meshes", d.note])
-            ),
-            "change": f"only the change to the next mesh is known: {d.note}",
-            "rounding": "the mesh represents the solution exactly, up to rounding",
-        }.get(d.kind, d.note)
-        return Cell.words(clean(text, 200))
-
-    return Table.of(
-        "Relative discretisation errors in the energy norm.",
-        meshes,
-        (
-            ("physical case", lambda d: Cell.name(d.case)),
-            ("unknowns", lambda d: unknowns(d, 0)),
-            ("error", error),
-            ("rate", lambda d: Cell.number(d.rate, lambda q: f"{q / 2:.2f}")),
-            ("finest mesh", lambda d: unknowns(d, 1)),
-            ("note", note),
-        ),
-        notes=(
-            "Estimated from reference solutions on meshes whose cell size h is halved "
-            "once and twice, without a solver under test. Rate: exponent of h in the "
-            "error.",
-        ),
-    )
 
 
 def _left_out(data: Data) -> Iterator[Part]:

@@ -68,7 +68,7 @@ cdef enum:
     FIRST_NEWTON = 100
     # Number of bits of the length of a spectral step. A small change of a length leads
     # to another sequence of spectral steps. If lengths are rounded, sums in another
-    # order (on another number of ranks) yield the same lengths, unless a length is
+    # order (on another number of processes) yield the same lengths, unless a length is
     # within rounding of the middle between two numbers with this number of bits.
     LENGTH_BITS = 8
 
@@ -84,8 +84,8 @@ cdef double LONG_STEP = 0.5
 # Two components or discs count as reaching the boundary at the same time if their step
 # lengths differ by at most this fraction. A step to the boundary is longer by this
 # fraction, so that both reach the boundary. In symmetric problems, such as greco/dim=3,
-# the lengths of mirror images differ by rounding (3e-14), and the number of ranks
-# determines which of the two lengths is shorter.
+# the lengths of mirror images differ by rounding (3e-14), which determines which of
+# the two lengths is shorter.
 cdef double TIE = 2.0 ** -42
 
 

@@ -20,7 +20,6 @@ import pytest
 import mortarbench as mb
 from mortarbench.cli.main import main
 from mortarbench.harness import InputError, Solution, Status
-from mortarbench.harness.crossval import discretisation
 from mortarbench.harness.files.reading import toml
 from mortarbench.harness.files.store import (
     load_fields,
@@ -314,21 +313,6 @@ def test_damaged_faults_are_refused_or_reported(tmp_path, count):
 
 
 @COUNTS
-def test_a_damaged_history_of_meshes_is_refused_or_reported(tmp_path, count):
-    chance, path = random.Random(count), tmp_path / discretisation.FILE
-    level = {"case": "c", "unknowns": 3, "distance": 0.1, "allowed": 0.01}
-    whole = {
-        "schema": 1,
-        "cases": [{"case": "c", "params": {"n": 4}, "levels": [level, level]}],
-    }
-    for _ in range(count):
-        text = json.dumps(damaged_texts.distorted(whole, chance))
-        text = damaged_texts.damaged(text, chance) if chance.random() < 0.3 else text
-        written(path, text)
-        tried(text, lambda: discretisation.read_discretisation(tmp_path))
-
-
-@COUNTS
 def test_damaged_vectors_are_read_or_refused(tmp_path, count):
     chance = np.random.default_rng(count)
     point = Solution(
@@ -402,7 +386,7 @@ ENTRIES = (
     (mb.solvers, [], {"plugins": (), "registries": None}),
     (mb.suites, [], {"registries": None}),
     (mb.validate, ["nowhere"], {
-        "budget": 0, "plugins": (), "progress": len, "registries": None,
+        "plugins": (), "progress": len, "registries": None,
     }),
     (lambda path: mb.build("obstacle/dim=1/n=4/primal").save(path), ["qp.npz"], {}),
 )  # fmt: skip
@@ -444,7 +428,7 @@ def test_damaged_values_on_the_command_line_are_refused_in_one_line(
     synthetic_results.write(tmp_path / "run", 1, 1, 1)
     commands = [
         ["report", "nowhere", "--factor", "10"], ["replay", "run", "68bf42c63dd7"],
-        ["validate", "nowhere", "--budget", "30"], ["list", "problems"],
+        ["validate", "nowhere"], ["list", "problems"],
         ["run", "demo.toml", "--time-limit", "60"], ["report", "run", "--format", "md"],
         ["solve", "beam-ring/Nr=4/dual", "--solver", "osqp", "--tol", "2"],
         ["export", "beam-ring/dual", "a.txt"], ["run", "nowhere", "--case", "*"],

@@ -31,17 +31,13 @@ class Doubled(Family):
     def complete(self, given):
         return {"n": 1, "twice": 2 * given.get("n", 1), **given}
 
-    def refined(self, params):
-        return {"n": 2 * params["n"]}
-
 
 def test_missing_attributes_of_a_family_have_defaults():
     family = as_family(Bare())
 
     assert family.complete({"n": 3}) == {"n": 3}
     assert family.complete({}) == {"n": 1}
-    assert family.refined({"n": 1}) is None
-    assert (family.path_suffix, family.singular) == (None, "")
+    assert family.path_suffix is None
     assert family.check({"n": -1}) is None
 
 
@@ -66,7 +62,7 @@ def test_a_family_that_inherits_is_not_wrapped():
 def test_a_case_has_its_name_parameters_and_family():
     family = Doubled()
     case = parse("doubled/n=3/only", {"doubled": family})
-    finer = assemble(family, family.refined(case.params), case.form)
+    finer = assemble(family, {"n": 6}, case.form)
 
     assert f"{case}" == case.name == "doubled/n=3/only"
     assert case.params == {"n": 3, "twice": 6}

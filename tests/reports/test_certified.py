@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import isotonic_regression
 
-from mortarbench.harness import InputError, Record, Verdict
-from mortarbench.harness.crossval.discretisation import FILE, Discretisation, Level
+from mortarbench.harness import Record, Verdict
 from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.data.time_at_accuracy import (
     isotonic,
@@ -21,7 +20,6 @@ from mortarbench.reports.data.time_at_accuracy import (
 from mortarbench.reports.folder import compose
 from mortarbench.reports.render.markdown import markdown
 from mortarbench.reports.sections.sweeps import certified_picture, certified_sweeps
-from mortarbench.reports.validation.report import mesh_table
 
 TOLS = (1e-2, 1e-4, 1e-6, 1e-8)
 
@@ -274,50 +272,11 @@ def test_the_curve_joins_certified_points_and_others_are_hollow():
         for r in sweep()
     ]  # fmt: skip
     evidence = Evidence(directory=Path(), records=arrange(records))
-    picture = certified_picture(certified_sweeps(evidence), ("a",), {"box": MESH})
+    picture = certified_picture(certified_sweeps(evidence), ("a",))
     (panel,) = picture.figure.panels
     joined, hollow = panel.marks
-    mesh = [rule.at for rule in panel.rules]
 
     assert joined.y == (1e-2, 1e-4, 1e-6)
     assert joined.look.dash is not None
     assert hollow.y == (1e-8,)
     assert (hollow.look.dash, hollow.look.fill) == (None, "none")
-    assert mesh == pytest.approx([MESH.error, MESH.error / 10])
-
-
-MESH = Discretisation(
-    case="box", kind="limit", error=5e-2, change=4e-2, rate=2.0,
-    levels=tuple(
-        Level(case="box", unknowns=4**k, energy=-1.0, norm=1.0, bound=1e-9)
-        for k in (3, 4, 5)
-    ),
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("kind", "error", "note", "told"),
-    [
-        (
-            "change",
-            0.1,
-            "a point load",
-            "only the change to the next mesh is known: a point load",
-        ),
-        ("limit", 0.0, "", "relative to the limit of fine meshes"),
-        ("rounding", 1e-8, "", "the mesh represents the solution exactly"),
-        ("unknown", None, "too large", "too large"),
-    ],
-)
-def test_notes_describe_unknown_mesh_errors(kind, error, note, told):
-    mesh = Discretisation(case="box", kind=kind, error=error, note=note)
-    table = mesh_table([mesh])
-
-    (row,) = (dict(zip(table.columns, row, strict=True)) for row in table.rows)
-    assert told in row["note"].text
-
-
-def test_a_damaged_file_causes_a_one_line_error(tmp_path):
-    (tmp_path / FILE).write_text("{")
-    with pytest.raises(InputError, match=FILE):
-        compose(Evidence(directory=tmp_path, records=tuple(sweep())))

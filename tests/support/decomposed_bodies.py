@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import QP, Friction
-from mortarbench.harness.distributed.comm import SERIAL, Lead
 from mortarbench.harness.mechanics import (
     NO_FRICTION,
     DecomposedMechanics,
@@ -52,7 +51,7 @@ def decompose_by_labels(
 def mechanics_of(problem: DecomposedProblem) -> DecomposedMechanics:
     """Return the data for certificates on one process, without an assembled K."""
     served = Served(TornBodies(problem))
-    return torn_mechanics(served, Lead(SERIAL, served))()
+    return torn_mechanics(served)()
 
 
 def parts_by(

@@ -46,13 +46,20 @@ class ThreadComm:
 
     def Dup(self) -> ThreadComm:
         self._copies += 1
-        new = _shared(self.size, self._shared.barriers)
-        return ThreadComm(self.rank, self._shared.copies.setdefault(self._copies, new))
+        copies, all_of_them = self._shared.copies, self._shared.every
+        new = copies.setdefault(self._copies, _shared(self.size, all_of_them))
+        return ThreadComm(self.rank, new)
 
-    def Reduce(self, part: np.ndarray, total: np.ndarray) -> None:
-        parts = self._exchange(part)
-        if not self.rank:
-            total[...] = sum(parts)
+    def Send(self, part: np.ndarray, dest: int, tag: int) -> None:
+        assert dest == 0
+        self._shared.parts[self.rank].put(part.copy())
+
+    def Recv(self, part: np.ndarray, source: int, tag: int) -> None:
+        while self._shared.parts[source].empty():
+            if self._shared.barrier.broken:
+                raise BrokenBarrierError
+            time.sleep(1e-4)
+        part[...] = self._shared.parts[source].get()
 
     def gather(self, value: Any) -> list[Any] | None:
         found = self._exchange(value)
@@ -94,22 +101,19 @@ class ThreadComm:
         return SimpleNamespace(Test=test, Wait=wait)
 
     def Abort(self, code: int) -> None:
-        for barrier in self._shared.barriers:
-            barrier.abort()
+        for shared in self._shared.every:
+            shared.barrier.abort()
 
 
-def _shared(size: int, barriers: list[Barrier]) -> SimpleNamespace:
-    """Return what the ranks of a communicator share.
-
-    barriers : barriers of all communicators of these ranks
-    """
-    barriers.append(Barrier(size))
-    if barriers[0].broken:  # a rank has ended all ranks
-        barriers[-1].abort()
-    return SimpleNamespace(
-        barrier=barriers[-1], barriers=barriers, slots=[b""] * size, gathered={},
-        copies={}, inboxes=[SimpleQueue() for _ in range(size)],
+def _shared(size: int, every: list[SimpleNamespace]) -> SimpleNamespace:
+    """Return data that ranks share, and add them to the list of all such data."""
+    shared = SimpleNamespace(
+        barrier=Barrier(size), slots=[b""] * size, gathered={}, copies={}, every=every,
+        inboxes=[SimpleQueue() for _ in range(size)],
+        parts=[SimpleQueue() for _ in range(size)],
     )  # fmt: skip
+    every.append(shared)
+    return shared
 
 
 def on_ranks(size: int, work: Callable[[Comm], T]) -> list[T | BaseException]:

@@ -21,9 +21,6 @@ class Numbers:
     def rank(self):
         return self.comm.rank
 
-    def quotient(self):
-        return 1 // (1 - self.comm.rank)
-
     def failing_on(self, rank):
         if self.comm.rank == rank:
             raise ValueError("no number")
@@ -134,20 +131,40 @@ def test_an_error_of_a_rank_that_serves_ends_all_ranks(monkeypatch, capfd):
     assert "ValueError: no number" in capfd.readouterr().err
 
 
-def test_an_error_of_a_call_on_one_rank_is_raised_by_rank_0():
-    """No rank waits for the others in this call; afterwards, rank 0 may call again."""
+def test_an_error_of_a_rank_that_serves_is_raised_by_rank_0():
+    """Rank 1 has sent its part of the sum, which must not meet the next sum."""
+
+    class Late(Numbers):
+        def failing_on(self, rank):
+            if self.comm.rank == rank:
+                raise ValueError("no number")
+            return self.comm.sum(self.own) if self.comm.rank else None
 
     def work(comm):
-        numbers = Numbers(comm, np.full(1, comm.rank))
+        numbers = Late(comm, np.arange(2.0) + comm.rank)
+        lead = Lead(comm, numbers)
 
-        def calls():
-            lead = Lead(comm, numbers)
-            with pytest.raises(RankFailedError, match="rank 1 of 2: ZeroDivisionErr"):
-                lead("quotient")
-            with pytest.raises(AttributeError, match="no attribute 'product'"):
-                lead("product")
-            return lead("total", 1.0, 0.0)
+        def call():
+            with pytest.raises(RankFailedError, match="rank 0 of 2: ValueError: no"):
+                lead("failing_on", 0)
+            return lead("total", 10.0, 0.0)
 
-        return led(comm, numbers, calls)
+        return led(comm, numbers, call)
 
-    assert results_of(2, work) == [1, 1]
+    assert [found.tolist() for found in results_of(2, work)] == [[10, 30]] * 2
+
+
+def test_the_objects_of_an_earlier_problem_are_refused():
+    lead = Lead(SERIAL, None)
+    with pytest.raises(RuntimeError, match="keep only the QP that they built last"):
+        lead("total", 1.0, 0.0)
+
+
+def test_an_error_of_all_ranks_in_a_service_is_that_of_rank_0():
+    def work(comm):
+        numbers = Numbers(comm, np.zeros(1))
+        with pytest.raises(AttributeError, match="no attribute 'product'"):
+            led(comm, numbers, lambda: Lead(comm, numbers)("product"))
+        return True
+
+    assert results_of(2, work) == [True, True]

@@ -63,7 +63,7 @@ def folder_of_run(tmp_path_factory, svg_only):
     (record,) = (r for r in mine if r.family == "contact-patch")
     keep_environment(folder, record.environment, {"machine": {}})
     with svg_only(), blank_figures():
-        mb.validate(folder, budget=1)
+        mb.validate(folder)
         mb.report(folder)
     (journal,) = (folder / "journal").iterdir()
     journal.write_text("".join(f"{r.to_json()}\n" for r in mine))
@@ -160,7 +160,7 @@ def read_by_every_command(
             ("report", folder), ("report", folder, folder),
             *(("replay", folder, run_id) for run_id in run_ids),
             ("merge", folder, "--out", tmp_path / "merged"),
-            ("validate", folder, "--budget", "0"), ("run", suite, "--out", folder),
+            ("validate", folder), ("run", suite, "--out", folder),
         ):  # fmt: skip
             with bounded():
                 code = main(Registries(), [*map(str, arguments)])
@@ -239,7 +239,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
     names = kinds_of_files(folder_of_run)
     assert {name.partition("/")[0].partition(".")[0] for name in names} >= {
         "journal", "vectors", "cases", "references", "report", "environments",
-        "environment", "suite", "faults", "validation", "discretisation", "", "files",
+        "environment", "suite", "faults", "validation", "", "files",
     }  # fmt: skip
     for i, name in enumerate(names):
         try_commands(

@@ -84,7 +84,7 @@ def test_each_content_is_copied_under_its_digest(measured, here, copy):
 def test_a_copied_folder_can_be_validated_replayed_and_reported(here, svg_only):
     (record,) = read_journal(here / "run")
 
-    found = mb.validate("run", budget=0)
+    found = mb.validate("run")
     again = mb.replay("run", record.run_id)
     with svg_only():
         report = mb.report("run")
@@ -142,7 +142,7 @@ def test_the_copy_is_used_if_the_original_has_changed(here):
     write_qp(here / "qps" / "qp.npz", 0.75)
 
     again = mb.replay("run", record.run_id)
-    found = mb.validate("run", budget=0)
+    found = mb.validate("run")
 
     assert again.reproduced
     assert again.distance == 0
@@ -282,7 +282,7 @@ def test_merged_folders_have_one_copy_of_a_file_at_two_paths(
     listed = json.loads((tmp_path / "both" / "files" / "copies.json").read_text())
     paths = [entry["path"] for entry in listed["files"]]
     assert paths == ["qps/qp.npz", "other/same.npz"]
-    found = mb.validate("both", budget=0)
+    found = mb.validate("both")
     assert found.agreed
     assert found.data["counts"]["answers"] == 2
     for record in read_journal(tmp_path / "both"):

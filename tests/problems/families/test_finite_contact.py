@@ -218,10 +218,3 @@ def test_a_softening_material_is_refused_at_the_softening_stretch():
     """The pressure on this material is largest at the stretch 1/√3."""
     with pytest.raises(InputError, match=r"material=svk softens from 0\.5774 on"):
         built("contact-patch", stretch=0.5, material="svk")
-
-
-def test_refinement_at_finite_strain_is_refused():
-    for family, own in CASES.values():
-        keys = {**own, "kinematics": "finite"}
-        with pytest.raises(InputError, match="expected kinematics=linear"):
-            family.refined(family.complete(keys))

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.sparse import csr_array, issparse
 
 from mortarbench.harness import InputError
-from mortarbench.harness.distributed.comm import SERIAL, Lead, led
+from mortarbench.harness.distributed.comm import SERIAL, led
 from mortarbench.harness.mechanics import Real
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
@@ -54,10 +54,10 @@ def built(name, comm):
     return build(comm, reference_of_operator)
 
 
-def facts(made, comm, s):
+def facts(made, s):
     """Return results of a case on rank 0, for given vectors and the answer `s`."""
-    lead, torn = Lead(comm, made.served), made.served.torn
-    case, parts = made.case(lead), parts_of(made.served, lead)
+    lead, torn = made.served.lead, made.served.torn
+    case, parts = made.case(), parts_of(made.served)
     qp, F = case.qp, case.qp.P.build()
     rng = np.random.default_rng(5)
     X, v = rng.standard_normal((qp.q.size, 2)), rng.standard_normal(torn.f.size)
@@ -97,7 +97,7 @@ def facts(made, comm, s):
 
 @cache
 def alone(name):
-    return facts(built(name, SERIAL), SERIAL, None)
+    return facts(built(name, SERIAL), None)
 
 
 @pytest.fixture(scope="module", params=CASES, ids=lambda p: p[0].partition("/")[0])
@@ -107,7 +107,7 @@ def both(request):
 
     def work(comm):
         made = built(name, comm)
-        return led(comm, made.served, lambda: facts(made, comm, s))
+        return led(comm, made.served, lambda: facts(made, s))
 
     return results_of(size, work)[0], alone(name)
 
@@ -190,7 +190,7 @@ def used(problem, size, monkeypatch):
             return problem.assemble_class(part)
 
         served = Served(TornBodies(replace(problem, assemble_class=assemble), comm))
-        F = operator_of(served, Lead(comm, served))
+        F = operator_of(served)
         led(comm, served, lambda: F @ np.ones(F.shape[0]))
         return served.domains, len(assembled)
 
@@ -221,7 +221,7 @@ def test_implicit_blocks_on_ranks_are_those_of_one_process(monkeypatch):
 
     def work(comm):
         served = Served(TornBodies(problem, comm))
-        P, m = operator_of(served, Lead(comm, served)), served.torn.rows.c.size
+        P, m = operator_of(served), served.torn.rows.c.size
         x = np.random.default_rng(6).standard_normal(m)
 
         def facts():

@@ -10,7 +10,6 @@ from scipy.linalg import null_space, orth
 from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Vector, no_rows
-from mortarbench.harness.distributed.comm import SERIAL, Lead
 from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.feti_dual import TornDual
@@ -102,7 +101,7 @@ def test_each_error_is_relative_to_its_own_eigenvalue(
 def dual_of(problem: DecomposedProblem) -> tuple[QP, csr_array]:
     """Return a dual on one process, and its rows B."""
     served = Served(TornBodies(problem))
-    return TornDual(served, Lead(SERIAL, served)).qp, served.torn.rows.B
+    return TornDual(served).qp, served.torn.rows.B
 
 
 @pytest.mark.parametrize("rows", ["orthonormal", "redundant"])

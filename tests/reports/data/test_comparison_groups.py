@@ -362,7 +362,7 @@ def test_the_sections_render(record, evidence):
     text = markdown(compose(evidence(some_records(record, 7))))
     for title in (
         "Means over cases",
-        "Dependence of the ranks on conventions",
+        "Dependence of the ranking on conventions",
         "Profiles",
     ):
         assert f"## {title}" in text

@@ -12,8 +12,8 @@ from mortarbench.reports.data.aggregation import (
     common_cases,
     geometric_means,
     panel,
+    rank_of,
     ranking_of,
-    ranks,
 )
 from mortarbench.reports.data.comparison_groups import ComparisonGroup, GroupKey
 from mortarbench.reports.statistics.censoring import restricted_mean
@@ -111,7 +111,7 @@ def test_ranks_do_not_depend_on_the_unit_of_time(factor):
     a, b = panel(one), panel(other)
     assert (a.usual == b.usual).all()
     for name, changed in a.single.items():
-        np.testing.assert_array_equal(changed.ranks, b.single[name].ranks)
+        np.testing.assert_array_equal(changed.ranking, b.single[name].ranking)
     np.testing.assert_allclose(ranking_of(one).ratios, ranking_of(other).ratios)
     assert (ranking_of(one).tiers == ranking_of(other).tiers).all()
 
@@ -267,7 +267,7 @@ def test_a_solver_with_false_claims_is_first_only_if_claims_count():
     claimed = np.column_stack([honest, np.full(8, 0.01)])
     found = panel(group(times, claimed=claimed))
     assert found.usual.tolist() == [1, 2]
-    assert found.single["claimed"].ranks.tolist() == [2, 1]
+    assert found.single["claimed"].ranking.tolist() == [2, 1]
     assert found.single["claimed"].turned.any()
     assert not found.single["10 limits"].turned.any()
 
@@ -278,14 +278,14 @@ def test_a_penalty_that_reverses_two_solvers_is_found():
     fast[0] = INF
     steady = np.full(5, 4.0)
     found = panel(group(np.column_stack([fast, steady]), limit=60))
-    assert found.single["1 limit"].ranks.tolist() == [1, 2]
-    assert found.single["10 limits"].ranks.tolist() == [2, 1]
+    assert found.single["1 limit"].ranking.tolist() == [1, 2]
+    assert found.single["10 limits"].ranking.tolist() == [2, 1]
     assert found.turned[0, 1]
     assert found.turned[1, 0]
 
 
 def test_ranks_are_nan_for_solvers_that_are_not_compared():
-    np.testing.assert_array_equal(ranks(np.array([2.0, np.nan, 1.0])), [2, np.nan, 1])
+    np.testing.assert_array_equal(rank_of(np.array([2.0, np.nan, 1.0])), [2, np.nan, 1])
 
 
 # ---- profiles
