@@ -41,7 +41,6 @@ from scipy.stats import linregress, t
 from sksparse.cholmod import cholesky
 
 from mortarbench.harness import Mechanics, certify, no_rows
-from mortarbench.harness.distributed.comm import SERIAL, Lead
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.duality.decomposed import decompose
@@ -99,7 +98,7 @@ def one(way, family, size, cells):
         layout = of.shape.layout(cells)
         parts = decompose(of, layout, "orthonormal", stage, contact)
         served = Served(TornBodies(parts))
-        subdomains = torn_mechanics(served, Lead(SERIAL, served), primal.P)
+        subdomains = torn_mechanics(served, primal.P)
         dual = feti_dual(served, primal)
     else:
         dual = dualise(primal, factorise_floating(bodies))
@@ -141,7 +140,7 @@ def final_face(served, qp, s):
     torn, d = served.torn, served.torn.problem.components
     empty = Contact(no_rows(d * torn.problem.layout.nodes), *np.zeros((2, 0)))
     alone = Served(torn.with_problem(replace(torn.problem, contact=empty)))
-    unbounded = TornDual(alone, Lead(SERIAL, alone)).qp
+    unbounded = TornDual(alone).qp
     equality = np.arange(qp.q.size) < torn.rows.equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
     names = [None, ("dirichlet", "multiplicity")]
