@@ -244,7 +244,7 @@ def test_no_choice_of_keys_is_another_case_on_ranks(seed):
 
         def work(comm, name=name, s=known["s"]):
             made = built(name, comm)
-            return led(comm, made.served, lambda: facts(made, comm, s))
+            return led(comm, made.served, lambda: facts(made, s))
 
         found = results_of(2 + seed % 2, work)[0]
         assert found["digest"] == known["digest"], name
