@@ -50,6 +50,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("checkouts", nargs="*", type=Path, metavar="CHECKOUT")
     options = parser.parse_args()
+    for checkout in options.checkouts:
+        if not (checkout / ".venv" / "bin" / "python").exists():
+            parser.error(f"{checkout}: no .venv/bin/python; expected a checkout")
     here = Path(__file__).resolve().parent.parent
     ways = [(c, n) for c in (here, *options.checkouts) for n in (1, 2)]
     found = {way: [] for way in ways}

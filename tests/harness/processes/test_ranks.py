@@ -270,6 +270,15 @@ def test_the_same_number_of_ranks_gives_the_same_bits(path):
 
 
 @pytest.mark.slow
+def test_the_parent_judges_a_sequence_of_a_plug_in_on_ranks(tmp_path):
+    (tmp_path / "mine.py").write_text(FILE)
+    text = SUITE.replace('"smalbe", "clarabel"', '"mine"').replace("[1, 2]", "[2]", 1)
+    records = run_suite(tmp_path, text, plugins=[tmp_path / "mine.py"]).records
+    assert [r.verdict for r in records] == ["verified"] * 3
+    assert all(r.energy_bound <= 1e-5 for r in records)
+
+
+@pytest.mark.slow
 def test_a_suite_declines_cases_with_fewer_subdomains_than_ranks(tmp_path):
     text = SUITE.replace('"smalbe", "clarabel"', '"smalbe"').replace("[1, 2]", "[3]", 1)
     head, _, _ = text.partition("[[problems]]")
