@@ -14,11 +14,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mortarbench.harness.crossval.assessment import (
     Assessment,
-    Deviation,
     assess,
     assess_point,
 )
@@ -27,9 +25,9 @@ from mortarbench.harness.crossval.references import (
     UnsolvedError,
     reference_point,
 )
-from mortarbench.harness.mechanics import Mechanics
+from mortarbench.harness.mechanics import Mechanics, Real
 from mortarbench.harness.plugin import Case, Reference
-from mortarbench.harness.qp import Matrix
+from mortarbench.harness.qp import Vector
 from mortarbench.harness.record import Record
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.active_set_refinement import suggested
@@ -54,16 +52,16 @@ class StoredAnswer:
 
 
 class GroundTruth(NamedTuple):
-    """A reference point, and the norm in which distances to this point are measured."""
+    """A reference point, and the norm in which errors are measured."""
 
     #: origin of the point: "reference", or the solver and form of an answer
     name: str
     doubt: float  #: bound on the relative error of the point in the energy norm
     closed: int | None  #: number of closed contact rows; None without mechanics
-    #: computes the errors of an answer relative to this point
-    assess: Callable[[StoredAnswer], tuple[Assessment, Deviation]]
-    P: Matrix  #: (n, n) matrix that defines the norm: the stiffness K, or P of the QP
-    kernel: NDArray[np.float64]  #: (n, r) rigid motions, whose norm is zero
+    #: computes the errors of an answer, and its difference from this point
+    assess: Callable[[StoredAnswer], tuple[Assessment, Vector]]
+    #: energy norm of a difference of two displacements; None without mechanics
+    norm: Callable[[Vector], float] | None
     note: str = ""  #: reason why an answer replaces the reference solution
 
 
@@ -89,7 +87,7 @@ def ground_truth_of(
         return truth
     point, name, why = truth
 
-    def assessed(g: StoredAnswer) -> tuple[Assessment, Deviation]:
+    def assessed(g: StoredAnswer) -> tuple[Assessment, Vector]:
         assert g.case.mechanics is not None
         at = g.case.mechanics.to_primal(g.solution)
         return assess(mechanics, point, at, g.record.asked_tol)
@@ -97,9 +95,11 @@ def ground_truth_of(
     exact = mechanics.exact
     contact = exact.contact
     closed = (point.multipliers * exact.compliance > -exact.motion(point.u))[contact]
-    kernel = mechanics.inverse.kernel
-    P = mechanics.primal.P
-    return GroundTruth(name, point.bound, int(closed.sum()), assessed, P, kernel, why)
+
+    def norm(v: Vector) -> float:
+        return mechanics.norm(v.astype(Real))
+
+    return GroundTruth(name, point.bound, int(closed.sum()), assessed, norm, why)
 
 
 def _elastic_truth(
@@ -174,14 +174,11 @@ def _plain_truth(
     worst = kkt_residuals(qp, s).worst
     if not worst <= MAX_REFERENCE_RESIDUAL:
         return f"{why}, and no answer satisfies the KKT conditions"
-    no_kernel = np.zeros((qp.q.size, 0))
 
-    def assessed(g: StoredAnswer) -> tuple[Assessment, Deviation]:
+    def assessed(g: StoredAnswer) -> tuple[Assessment, Vector]:
         return assess_point(qp, s, g.solution)
 
-    return GroundTruth(
-        name, float(np.sqrt(2 * worst)), None, assessed, qp.P, no_kernel, why
-    )
+    return GroundTruth(name, float(np.sqrt(2 * worst)), None, assessed, None, why)
 
 
 @np.errstate(all="ignore")  # components of a point may be as large as 1e300
