@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -101,16 +100,14 @@ def compare_answers(
     name: str,
     answers: Sequence[StoredAnswer],
     solve: Reference,
-    references: Path | None,
 ) -> Problem:
     """Assess all answers to one problem.
 
     answers : answers to cases with equal ``mechanics.program``, or to a single QP
         without mechanics
     solve : function that solves a QP accurately
-    references : folder in which reference points are cached; None to disable the cache
     """
-    truth = ground_truth_of(answers, solve, references)
+    truth = ground_truth_of(answers, solve)
     if isinstance(truth, str):
         unassessed = tuple(_answer(g, None, None) for g in answers)
         return Problem(

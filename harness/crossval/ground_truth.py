@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -66,21 +65,20 @@ class GroundTruth(NamedTuple):
 
 
 def ground_truth_of(
-    answers: Sequence[StoredAnswer], solve: Reference, references: Path | None
+    answers: Sequence[StoredAnswer], solve: Reference
 ) -> GroundTruth | str:
     """Return the reference point, or the reason why it is missing.
 
     answers : all answers to the problem; the best answer may replace a missing
         reference
     solve : function that solves a QP accurately
-    references : folder in which reference points are cached; None to disable the cache
     """
     mechanics = answers[0].case.mechanics
     if mechanics is None:
         return _plain_truth(answers, solve)
     mechanics = mechanics.whole
     try:
-        truth = _elastic_truth(mechanics, answers, solve, references)
+        truth = _elastic_truth(mechanics, answers, solve)
     except Exception as e:  # raised by the factorisation, which is code of the family
         return note_of("reference", e)
     if isinstance(truth, str):
@@ -106,14 +104,13 @@ def _elastic_truth(
     mechanics: Mechanics,
     answers: Sequence[StoredAnswer],
     solve: Reference,
-    references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:
     """Return the reference point, its origin, and a note if the point is an answer.
 
     Without a reference point, return a message with the reason instead.
     """
     try:
-        return reference_point(mechanics, solve, references), "reference", ""
+        return reference_point(mechanics, solve), "reference", ""
     except UnsolvedError as e:
         best = _best_certified(mechanics, answers)
         return (

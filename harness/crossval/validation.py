@@ -84,10 +84,6 @@ class _Folder:
     families: Mapping[str, Family]
     reference: Reference
 
-    @property
-    def references(self) -> Path:
-        return self.path / "references"
-
 
 class _Part(NamedTuple):
     """Result of the cross-validation of one physical case, in all its forms."""
@@ -181,12 +177,11 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         of = g.case.mechanics
         key = g.record.case if of is None else qp_digest(of.program)
         by_numbers.setdefault(key, []).append(g)
-    solve, cache = folder.reference, folder.references
     problems: list[Problem] = []
     for same in by_numbers.values():
         forms = ", ".join(dict.fromkeys(g.record.form for g in same))
         called = name if len(by_numbers) == 1 else f"{name} ({forms})"
-        problems.append(compare_answers(called, same, solve, cache))
+        problems.append(compare_answers(called, same, folder.reference))
     proven = [
         p for p in problems if p.doubt is not None and p.doubt < MAX_SOLUTION_ERROR
     ]

@@ -312,7 +312,7 @@ def test_different_multipliers_of_one_contact_force_agree(duplicate):
     shares = {"first": (1.5, 0.0), "second": (0.0, 1.5), "both": (0.5, 1.0)}
     answers = [stored_answer(duplicate, k, pushed(z)) for k, z in shares.items()]
 
-    found = compare_answers("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution)
 
     assert found.truth == "reference"
     assert all(a.assessment.equilibrium_error < 1e-15 for a in found.answers)
@@ -343,7 +343,7 @@ def test_without_a_reference_the_certificate_identifies_the_inaccurate_answer(
     ]
     answers.append(stored_answer(duplicate, "good", good))
 
-    found = compare_answers("wall", answers, finds_nothing, None)
+    found = compare_answers("wall", answers, finds_nothing)
 
     assert found.truth == "good on primal"
     assert "it found nothing" in found.note
@@ -481,7 +481,7 @@ def test_failing_mechanics_do_not_remove_the_residuals(duplicate):
     answers = [stored_answer(replace(duplicate, mechanics=mechanics), k, pushed(z))
                for k, z in {"good": (1.5, 0.0), "bad": (1.6, 0.0)}.items()]  # fmt: skip
 
-    found = compare_answers("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution)
 
     assert found.truth == ""
     assert "no factor" in found.note
@@ -614,7 +614,7 @@ def test_a_failing_recovery_affects_only_that_answer(duplicate):
     answers = [stored_answer(case, k, pushed(z)) for k, z in
                {"a": (1.5, 0.0), "lost": (0.0, 1.5)}.items()]  # fmt: skip
 
-    found = compare_answers("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution)
 
     assert [a.assessment is None for a in found.answers] == [False, True]
     assert "no way back" in found.answers[1].remarks[0]
