@@ -33,8 +33,6 @@ from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, load_registries, one_thread
 from mortarbench.text import align, printable
 
-#: solver with which the answers of the other solvers are compared
-COMPARED_WITH = "smalbe"
 TIME_LIMIT = 10.0  #: time limit for each check of the conformance suite, in s
 MEMORY_LIMIT = 4096.0  #: memory limit for each check, in MiB
 #: largest number of entries in a list on the terminal; the page lists all entries
@@ -46,7 +44,7 @@ _EQUAL_FAILURES = 3  #: smallest number of checks with equal failures that are o
 class Validation:
     """Result of a cross-validation."""
 
-    agreed: bool  #: True if no claim is refuted and no two answers disagree
+    agreed: bool  #: True if no claim is refuted and no certificate is wrong
     data: Mapping[str, Any]  #: contents of validation.json
     pages: tuple[Path, ...]  #: files of the page on the validation
 
@@ -98,7 +96,7 @@ def validate(
     registries = load_registries(plugins, registries)
     families = registries.families_with_copies(path)
     result = validate_folder(path, families, registries.reference, progress)
-    data = as_data(result, path.resolve().name, ours=COMPARED_WITH)
+    data = as_data(result, path.resolve().name)
     if not (data["counts"]["answers"] or result.false_claims or result.proven):
         reasons = [entry.text for entry in result.not_validated]
         why = reasons[0] if reasons else "no answer claims a solution"
@@ -115,11 +113,6 @@ def as_text(data: Mapping[str, Any]) -> str:
     parts = [printable(data["headline"]), _solvers(data["solvers"])]
     entries = {
         "Refuted claims": _refuted(data["disagreements"]),
-        "Contradictory pairs of answers, neither refuted": [
-            f"{d['problem']}, tol {d['tol']:g}: {' and '.join(d['between'])} are "
-            f"{_e(d['distance'])} apart, allowed {_e(d['allowed'])}"
-            for d in data["unresolved"]
-        ],
         "Certificates contradicted (an error of this program)": [
             f"{_measured(d)}: {d['text']}" for d in data["contradictions"]
         ],
@@ -152,10 +145,7 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
         "penetration": "penetration/h",
         "balance": "balance",
         "primal_dual": "primal-dual",
-        "from_ours": "from smalbe",
     }
-    if all(row["from_ours"] is None for row in rows):
-        del columns["from_ours"]  # smalbe has no answers here
     head = ["solver", "tol", "answers", "refuted", "unanswered", *columns.values()]
     lines = [
         [

@@ -21,9 +21,7 @@ max(λᵢDᵢ, gapᵢ) > sᵢ for the reference and for the answer.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +30,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness.crossval.references import ReferencePoint
 from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
-from mortarbench.harness.qp import QP, Matrix, Vector
+from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.active_set_refinement import equilibrium
 from mortarbench.harness.verify.kkt import allowed
@@ -61,14 +59,6 @@ class Assessment:
     pulls: tuple[int, ...] = ()
 
 
-class Deviation(NamedTuple):
-    """Difference of an answer from the reference, divided by ‖u*‖; see `distances`."""
-
-    u: Vector  #: (n,) difference of u, or of x for a QP without mechanics
-    #: (n,) difference of the displacements u_λ; None without mechanics
-    equilibrium: Vector | None
-
-
 def energy_allowed(tol: float) -> float:
     """Return √(20 tol), a bound on the relative error of answers verified at `tol`."""
     return float(np.sqrt(2 * allowed(tol)))
@@ -77,8 +67,8 @@ def energy_allowed(tol: float) -> float:
 @np.errstate(all="ignore")  # components of a point may be as large as 1e300
 def assess(
     mechanics: Mechanics, truth: ReferencePoint, s: Solution, tol: float
-) -> tuple[Assessment, Deviation]:
-    """Compute the errors of an answer to a problem with mechanics.
+) -> tuple[Assessment, Vector]:
+    """Compute the errors of an answer, and (u − u*)/‖u*‖ (n,).
 
     If ‖u*‖ = 0, errors are relative to the energy norm of the displacement under the
     load without contact.
@@ -112,15 +102,12 @@ def assess(
         rows=_numbers(contradicted),
         pulls=_numbers(beyond > small),
     )
-    scale = length or 1.0
-    return assessment, Deviation(
-        np.asarray(off / scale, dtype=float), np.asarray(off_rest / scale, dtype=float)
-    )
+    return assessment, np.asarray(off / (length or 1.0), dtype=float)
 
 
 @np.errstate(all="ignore")
-def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Deviation]:
-    """Compute the errors of a finite point of a QP without mechanics.
+def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Vector]:
+    """Compute the errors of a finite point of a QP without mechanics, and x − x*.
 
     Errors are measured in the seminorm ‖·‖_P, relative to `point_norm`. The errors do
     not depend on the choice of the reference solution, since Px is equal for all
@@ -138,38 +125,12 @@ def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Devi
         balance=None,
         active=None,
     )
-    return assessment, Deviation(off / (norm or 1.0), None)
+    return assessment, off
 
 
 def point_norm(qp: QP, s: Solution) -> float:
     """Return √max(xᵀPx, |qᵀx|), the scale of errors in the seminorm ‖·‖_P."""
     return float(np.sqrt(max(s.x @ (qp.P @ s.x), abs(qp.q @ s.x))))
-
-
-@np.errstate(all="ignore")
-def distances(
-    P: Matrix, kernel: NDArray[np.float64], points: Sequence[Vector]
-) -> NDArray[np.float64]:
-    """Return the distances ‖vᵢ − vⱼ‖_P of all pairs of points (k, k).
-
-    A distance is inf if one of its points is not finite.
-
-    The distances are computed from the Gram matrix. Because of cancellation, distances
-    below 1e-8 of the norm of the longer vector are inaccurate. The points must
-    therefore be deviations from a common reference.
-
-    P : (n, n) stiffness, or matrix of a QP
-    kernel : (n, r) orthonormal rigid motions, which are projected out
-    points : k vectors (n,)
-    """
-    V = np.stack(points, axis=1)
-    V = V - kernel @ (kernel.T @ V)
-    gram = V.T @ np.asarray(P @ V)
-    norms = np.diag(gram)  # squared norms of the points
-    squares = np.maximum(norms[:, None] + norms[None, :] - 2 * gram, 0)
-    lengths = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
-    np.fill_diagonal(lengths, 0)  # inf − inf would be NaN
-    return np.asarray(lengths)
 
 
 def _closed(

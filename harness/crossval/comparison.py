@@ -1,4 +1,4 @@
-"""Comparison of all answers to one problem with a reference and with each other.
+"""Comparison of all answers to one problem with a reference.
 
 The reference is a point with an error bound (`harness.crossval.ground_truth`), which is
 computed independently of the solvers under test if the reference solve succeeds. A
@@ -6,23 +6,19 @@ claim of success is refuted if a residual is too large, if a multiplier is inadm
 or if the distance of the answer to the reference, minus the error bound
 of the reference, exceeds the error that the claim permits
 (`harness.crossval.assessment`). Agreement of several answers is not used as evidence.
-If two answers differ by more than the sum of the permitted errors, and neither answer
-is refuted, the disagreement is unresolved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
-from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from mortarbench.harness.crossval.assessment import (
     Assessment,
-    Deviation,
-    distances,
     energy_allowed,
 )
 from mortarbench.harness.crossval.ground_truth import (
@@ -34,6 +30,7 @@ from mortarbench.harness.crossval.ground_truth import (
 )
 from mortarbench.harness.errors import some
 from mortarbench.harness.plugin import Reference
+from mortarbench.harness.qp import Vector
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.solution import Status
 from mortarbench.harness.verify.kkt import allowed, verdict
@@ -75,17 +72,12 @@ class Answer:
         return max(a.error, a.equilibrium_error or 0.0) + self.doubt
 
 
-class Pair(NamedTuple):
-    """Distances between two answers, relative to the norm or energy of the solution."""
+class FormDistance(NamedTuple):
+    """Largest distance between primal and dual answers of one solver."""
 
-    a: int  #: index of the first answer
-    b: int  #: index of the second answer
-    distance: float  #: distance ‖u − u'‖ of the displacements in the energy norm
-    #: ‖Bᵀ(λ − λ')‖, distance of the contact forces in the dual norm; None without
-    #: mechanics
-    equilibrium: float | None
-    energy: float  #: |J(u) − J(u')|, difference of potential energies
-    allowed: float  #: sum of the errors that the two claims permit
+    solver: str
+    tol: float
+    distance: float  #: ‖u − u'‖ in the energy norm, relative to ‖u*‖
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,9 +92,7 @@ class Problem:
     doubt: float | None
     closed: int | None  #: number of closed rows at the reference point
     answers: tuple[Answer, ...]
-    pairs: tuple[Pair, ...]  #: pairs of answers at equal tolerances
-    #: pairs whose distance exceeds `allowed` although neither answer is refuted
-    unresolved: tuple[Pair, ...]
+    primal_dual: tuple[FormDistance, ...]
     note: str = ""  #: reason why the reference is missing or replaced
 
 
@@ -110,16 +100,14 @@ def compare_answers(
     name: str,
     answers: Sequence[StoredAnswer],
     solve: Reference,
-    references: Path | None,
 ) -> Problem:
     """Assess all answers to one problem.
 
     answers : answers to cases with equal ``mechanics.program``, or to a single QP
         without mechanics
     solve : function that solves a QP accurately
-    references : folder in which reference points are cached; None to disable the cache
     """
-    truth = ground_truth_of(answers, solve, references)
+    truth = ground_truth_of(answers, solve)
     if isinstance(truth, str):
         unassessed = tuple(_answer(g, None, None) for g in answers)
         return Problem(
@@ -128,8 +116,7 @@ def compare_answers(
             doubt=None,
             closed=None,
             answers=unassessed,
-            pairs=(),
-            unresolved=(),
+            primal_dual=(),
             note=truth,
         )
     judged, deviations = [], []
@@ -140,26 +127,15 @@ def compare_answers(
             g = replace(g, remarks=(*g.remarks, note_of("distance", e)))
             judged.append(_answer(g, None, None))
             continue
-        deviations.append((len(judged), deviation))
         judged.append(_answer(g, assessment, truth.doubt))
-    pairs = _pairs(judged, deviations, truth)
-    unresolved = [
-        p
-        for p in pairs
-        if max(p.distance, p.equilibrium or 0.0) > p.allowed
-        and all(
-            judged[i].claimed == Status.SOLVED and not judged[i].refuted
-            for i in (p.a, p.b)
-        )
-    ]
+        deviations.append((judged[-1], deviation))
     return Problem(
         name=name,
         truth=truth.name,
         doubt=truth.doubt,
         closed=truth.closed,
         answers=tuple(judged),
-        pairs=tuple(pairs),
-        unresolved=tuple(unresolved),
+        primal_dual=tuple(_between_forms(deviations, truth)),
         note=truth.note,
     )
 
@@ -236,37 +212,24 @@ def _refutations(a: Answer) -> Iterable[str]:
         yield f"inadmissible multipliers at rows {some(map(str, a.assessment.pulls))}"
 
 
-def _pairs(
-    answers: Sequence[Answer],
-    places: Sequence[tuple[int, Deviation]],
-    truth: GroundTruth,
-) -> list[Pair]:
-    """Compute the distances of all pairs of answers at equal tolerances.
+@np.errstate(all="ignore")  # components of a point may be as large as 1e300
+def _between_forms(
+    deviations: Sequence[tuple[Answer, Vector]], truth: GroundTruth
+) -> Iterator[FormDistance]:
+    """Yield the largest distance between primal and dual answers of each solver.
 
-    places : index in `answers`, and deviation, of each answer with an assessment
+    deviations : answers and their differences (u − u*)/‖u*‖ from the reference
     """
-    if not places:
-        return []
-    apart = partial(distances, truth.P, truth.kernel)
-    u = apart([d.u for _, d in places])
-    rest = [d.equilibrium for _, d in places if d.equilibrium is not None]
-    lam = apart(rest) if rest else None
-    pairs = []
-    for (i, (p, _)), (j, (q, _)) in combinations(enumerate(places), 2):
-        a, b = answers[p], answers[q]
-        if a.tol != b.tol or a.assessment is None or b.assessment is None:
-            continue
-        pairs.append(
-            Pair(
-                a=p,
-                b=q,
-                distance=float(u[i, j]),
-                equilibrium=None if lam is None else float(lam[i, j]),
-                energy=abs(a.assessment.energy - b.assessment.energy),
-                allowed=a.energy_allowed + b.energy_allowed,
-            )
-        )
-    return pairs
+    if truth.norm is None:
+        return
+    largest: dict[tuple[str, float], float] = {}
+    for (a, u), (b, v) in combinations(deviations, 2):
+        key = a.solver, a.tol
+        if key == (b.solver, b.tol) and (a.form == "primal") != (b.form == "primal"):
+            distance = nan_last(truth.norm(u - v))
+            largest[key] = max(largest.get(key, 0.0), distance)
+    for (solver, tol), distance in largest.items():
+        yield FormDistance(solver, tol, distance)
 
 
 def brief(value: float) -> str:

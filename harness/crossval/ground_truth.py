@@ -10,15 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mortarbench.harness.crossval.assessment import (
     Assessment,
-    Deviation,
     assess,
     assess_point,
 )
@@ -27,9 +24,9 @@ from mortarbench.harness.crossval.references import (
     UnsolvedError,
     reference_point,
 )
-from mortarbench.harness.mechanics import Mechanics
+from mortarbench.harness.mechanics import Mechanics, Real
 from mortarbench.harness.plugin import Case, Reference
-from mortarbench.harness.qp import Matrix
+from mortarbench.harness.qp import Vector
 from mortarbench.harness.record import Record
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.active_set_refinement import suggested
@@ -54,42 +51,41 @@ class StoredAnswer:
 
 
 class GroundTruth(NamedTuple):
-    """A reference point, and the norm in which distances to this point are measured."""
+    """A reference point, and the norm in which errors are measured."""
 
     #: origin of the point: "reference", or the solver and form of an answer
     name: str
     doubt: float  #: bound on the relative error of the point in the energy norm
     closed: int | None  #: number of closed contact rows; None without mechanics
-    #: computes the errors of an answer relative to this point
-    assess: Callable[[StoredAnswer], tuple[Assessment, Deviation]]
-    P: Matrix  #: (n, n) matrix that defines the norm: the stiffness K, or P of the QP
-    kernel: NDArray[np.float64]  #: (n, r) rigid motions, whose norm is zero
+    #: computes the errors of an answer, and its difference from this point
+    assess: Callable[[StoredAnswer], tuple[Assessment, Vector]]
+    #: energy norm of a difference of two displacements; None without mechanics
+    norm: Callable[[Vector], float] | None
     note: str = ""  #: reason why an answer replaces the reference solution
 
 
 def ground_truth_of(
-    answers: Sequence[StoredAnswer], solve: Reference, references: Path | None
+    answers: Sequence[StoredAnswer], solve: Reference
 ) -> GroundTruth | str:
     """Return the reference point, or the reason why it is missing.
 
     answers : all answers to the problem; the best answer may replace a missing
         reference
     solve : function that solves a QP accurately
-    references : folder in which reference points are cached; None to disable the cache
     """
     mechanics = answers[0].case.mechanics
     if mechanics is None:
         return _plain_truth(answers, solve)
     mechanics = mechanics.whole
     try:
-        truth = _elastic_truth(mechanics, answers, solve, references)
+        truth = _elastic_truth(mechanics, answers, solve)
     except Exception as e:  # raised by the factorisation, which is code of the family
         return note_of("reference", e)
     if isinstance(truth, str):
         return truth
     point, name, why = truth
 
-    def assessed(g: StoredAnswer) -> tuple[Assessment, Deviation]:
+    def assessed(g: StoredAnswer) -> tuple[Assessment, Vector]:
         assert g.case.mechanics is not None
         at = g.case.mechanics.to_primal(g.solution)
         return assess(mechanics, point, at, g.record.asked_tol)
@@ -97,23 +93,24 @@ def ground_truth_of(
     exact = mechanics.exact
     contact = exact.contact
     closed = (point.multipliers * exact.compliance > -exact.motion(point.u))[contact]
-    kernel = mechanics.inverse.kernel
-    P = mechanics.primal.P
-    return GroundTruth(name, point.bound, int(closed.sum()), assessed, P, kernel, why)
+
+    def norm(v: Vector) -> float:
+        return mechanics.norm(v.astype(Real))
+
+    return GroundTruth(name, point.bound, int(closed.sum()), assessed, norm, why)
 
 
 def _elastic_truth(
     mechanics: Mechanics,
     answers: Sequence[StoredAnswer],
     solve: Reference,
-    references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:
     """Return the reference point, its origin, and a note if the point is an answer.
 
     Without a reference point, return a message with the reason instead.
     """
     try:
-        return reference_point(mechanics, solve, references), "reference", ""
+        return reference_point(mechanics, solve), "reference", ""
     except UnsolvedError as e:
         best = _best_certified(mechanics, answers)
         return (
@@ -174,14 +171,11 @@ def _plain_truth(
     worst = kkt_residuals(qp, s).worst
     if not worst <= MAX_REFERENCE_RESIDUAL:
         return f"{why}, and no answer satisfies the KKT conditions"
-    no_kernel = np.zeros((qp.q.size, 0))
 
-    def assessed(g: StoredAnswer) -> tuple[Assessment, Deviation]:
+    def assessed(g: StoredAnswer) -> tuple[Assessment, Vector]:
         return assess_point(qp, s, g.solution)
 
-    return GroundTruth(
-        name, float(np.sqrt(2 * worst)), None, assessed, qp.P, no_kernel, why
-    )
+    return GroundTruth(name, float(np.sqrt(2 * worst)), None, assessed, None, why)
 
 
 @np.errstate(all="ignore")  # components of a point may be as large as 1e300

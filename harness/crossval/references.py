@@ -5,27 +5,20 @@ and friction rows, unless this QP is too large (`_identified`). The solution of 
 identifies the closed rows, which hold with equality: contacts that touch and friction
 that sticks. `harness.verify.active_set_refinement` then computes the solution in
 extended precision, and `harness.verify.certificate` bounds the error of this solution.
-The cache contains only the states of the rows and the multipliers, which determine the
-directions of slip. A later run uses the cached data as an initial guess.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.qpfile import qp_digest
-from mortarbench.harness.files.store import read_arrays, write_arrays
-from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
+from mortarbench.harness.mechanics import Extended, Mechanics, Real
 from mortarbench.harness.plugin import Reference
 from mortarbench.harness.qp import QP, no_rows
 from mortarbench.harness.verify.active_set_refinement import (
     CLOSED,
-    UPPER,
     ActiveSet,
     States,
     exchanged,
@@ -35,11 +28,6 @@ from mortarbench.harness.verify.active_set_refinement import (
 from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
-
-#: a result computed from the cache is discarded if its error bound exceeds this value
-MAX_CACHED_BOUND = 1e-7
-#: Names and types of the cached arrays.
-STORED = {"states": np.dtype(np.int8), "multipliers": np.dtype(float)}
 
 
 class UnsolvedError(Exception):
@@ -63,15 +51,11 @@ class ReferencePoint:
         return np.asarray(self.states == CLOSED)
 
 
-def reference_point(
-    mechanics: Mechanics, solve: Reference, folder: Path | None = None
-) -> ReferencePoint:
-    """Solve the elastic problem of a case, starting from cached states if available.
+def reference_point(mechanics: Mechanics, solve: Reference) -> ReferencePoint:
+    """Solve the elastic problem of a case, and certify the solution.
 
     solve : solves the dual QP, min ½λᵀFλ − dᵀλ subject to RᵀBᵀλ = Rᵀf, λ ≥ 0 for
         contact and ‖λ‖ ≤ g for friction
-    folder : directory of cached states, with a file for each problem; None to disable
-        the cache
 
     Raises
     ------
@@ -80,46 +64,7 @@ def reference_point(
 
     """
     mechanics = mechanics.whole
-    path = folder / f"{qp_digest(mechanics.program)}.npz" if folder else None
-    exact = mechanics.exact
-    stored = _stored(path, exact) if path is not None and path.exists() else None
-    if stored is not None:
-        point = _solved(mechanics, stored)
-        if point.bound <= MAX_CACHED_BOUND:
-            return point
-    point = _solved(mechanics, _identified(mechanics, solve))
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_arrays(
-            path,
-            {k: getattr(point, k).astype(kind) for k, kind in STORED.items()},
-        )
-    return point
-
-
-def _stored(path: Path, exact: Exact) -> ActiveSet | None:
-    """Read a cached active set; return None if the file is damaged."""
-    try:
-        arrays = read_arrays(path, tuple(STORED))
-    except InputError:
-        return None
-    states, multipliers = (arrays[name] for name in STORED)
-    fits = all(
-        arrays[name].dtype == kind and arrays[name].shape == exact.c.shape
-        for name, kind in STORED.items()
-    )
-    if not fits or (np.abs(states) > 1).any() or not np.isfinite(multipliers).all():
-        return None
-    states = np.where(exact.contact & (states == UPPER), CLOSED, states)
-    # pass the multipliers as the motion, since only the direction is used
-    pushed = predicted(
-        exact.forces, 0 * multipliers.astype(Real), exact.compliance, multipliers
-    )
-    return ActiveSet(states.astype(np.int8), pushed.limits)
-
-
-def _solved(mechanics: Mechanics, guess: ActiveSet) -> ReferencePoint:
-    u, lam, active = exchanged(mechanics, guess)
+    u, lam, active = exchanged(mechanics, _identified(mechanics, solve))
     try:
         certificate = proof(Undivided(mechanics), u, u, lam, active.closed)
     except UncertifiableError as e:

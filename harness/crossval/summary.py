@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
-from mortarbench.harness.crossval.comparison import Answer, Pair, Problem
+from mortarbench.harness.crossval.comparison import Answer, Problem
 from mortarbench.harness.crossval.validation import Listed, Validation
 from mortarbench.harness.errors import some
 from mortarbench.harness.record import finite
@@ -37,14 +37,12 @@ class Row:
     #: number of contact rows, over all answers, whose state contradicts the reference
     contradicted_rows: int
     primal_dual: float | None  #: largest distance between primal and dual answers
-    from_ours: float | None  #: largest distance from the answers of `ours`
 
 
-def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
-    """Return the summary of a cross-validation, followed by all answers and pairs.
+def as_data(validation: Validation, folder: str) -> dict[str, Any]:
+    """Return the summary of a cross-validation, followed by all answers.
 
     folder : name of the result folder
-    ours : label of the solver with which all other solvers are compared
     """
     answers = [a for p in validation.problems for a in p.answers]
     refuted = [a for a in answers if a.refuted]
@@ -52,7 +50,6 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
         *map(_disagreement, refuted),
         *map(_without_point, validation.false_claims),
     ]
-    unresolved = [_apart(p, pair) for p in validation.problems for pair in p.unresolved]
     broken = [_remark(a, a.contradiction) for a in answers if a.contradiction]
     remarks = [_remark(a, text) for a in answers if not a.refuted for text in a.remarks]
     counts = {
@@ -60,9 +57,7 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
         "cases": len({a.case for a in answers}),
         "solvers": len({a.solver for a in answers}),
         "answers": len(answers),
-        "pairs": sum(len(p.pairs) for p in validation.problems),
         "refuted": len(wrong),
-        "unresolved": len(unresolved),
         "contradictions": len(broken),
         "remarks": len(remarks),
         "unanswered": len(validation.unanswered),
@@ -81,9 +76,8 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
         "agreed": validation.agreed,
         "headline": _headline(validation.agreed, counts, wrong),
         "counts": counts,
-        "solvers": [asdict(row) for row in _rows(validation, ours)],
+        "solvers": [asdict(row) for row in _rows(validation)],
         "disagreements": wrong,
-        "unresolved": unresolved,
         "contradictions": broken,
         "remarks": remarks,
         "unanswered": list(map(asdict, validation.unanswered)),
@@ -94,21 +88,21 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
     return dict(finite(plain(data)))
 
 
-def _rows(validation: Validation, ours: str) -> list[Row]:
+def _rows(validation: Validation) -> list[Row]:
     """Summarise each solver at each tolerance.
 
-    Rows are sorted by tolerance, loosest first, then by solver, with `ours` first.
+    Rows are sorted by tolerance, loosest first, then by solver.
     """
     answers = [a for p in validation.problems for a in p.answers]
     keys = {(a.solver, a.tol) for a in answers}
     keys |= {
         (x.solver, x.tol) for x in (*validation.false_claims, *validation.unanswered)
     }
-    ordered = sorted(keys, key=lambda key: (-key[1], key[0] != ours, key[0]))
-    return [_row(validation, solver, tol, ours) for solver, tol in ordered]
+    ordered = sorted(keys, key=lambda key: (-key[1], key[0]))
+    return [_row(validation, solver, tol) for solver, tol in ordered]
 
 
-def _row(validation: Validation, solver: str, tol: float, ours: str) -> Row:
+def _row(validation: Validation, solver: str, tol: float) -> Row:
     answers = [
         a
         for p in validation.problems
@@ -131,8 +125,12 @@ def _row(validation: Validation, solver: str, tol: float, ours: str) -> Row:
         penetration=_worst(a.penetration for a in measured),
         balance=_worst(a.balance for a in measured),
         contradicted_rows=sum(len(a.rows) for a in measured),
-        primal_dual=_worst(_between_forms(validation.problems, solver, tol)),
-        from_ours=_worst(_between(validation.problems, solver, ours, tol)),
+        primal_dual=_worst(
+            d.distance
+            for p in validation.problems
+            for d in p.primal_dual
+            if (d.solver, d.tol) == (solver, tol)
+        ),
     )
 
 
@@ -144,38 +142,14 @@ def _worst(values: Iterable[float | None]) -> float | None:
     return max((v for v in values if v is not None), default=None)
 
 
-def _between_forms(
-    problems: Sequence[Problem], solver: str, tol: float
-) -> Iterable[float]:
-    """Yield the distances between primal and dual answers of a solver."""
-    for p in problems:
-        for pair in p.pairs:
-            a, b = p.answers[pair.a], p.answers[pair.b]
-            if (a.solver, b.solver, a.tol) != (solver, solver, tol):
-                continue
-            if (a.form == "primal") != (b.form == "primal"):
-                yield pair.distance
-
-
-def _between(
-    problems: Sequence[Problem], solver: str, other: str, tol: float
-) -> Iterable[float]:
-    """Yield the distances between the answers of two solvers, whatever their forms."""
-    for p in problems:
-        for pair in p.pairs:
-            a, b = p.answers[pair.a], p.answers[pair.b]
-            if a.tol == tol and sorted((a.solver, b.solver)) == sorted((solver, other)):
-                yield pair.distance
-
-
 def _headline(
     agreed: bool, counts: dict[str, int], wrong: Sequence[dict[str, Any]]
 ) -> str:
     """Return the result of the cross-validation as one or two sentences."""
-    answers, solvers, cases, pairs = (
-        _many(counts[f"{noun}s"], noun) for noun in ("answer", "solver", "case", "pair")
+    answers, solvers, cases = (
+        _many(counts[f"{noun}s"], noun) for noun in ("answer", "solver", "case")
     )
-    what = f"{answers} of {solvers} to {cases}, {pairs} compared"
+    what = f"{answers} of {solvers} to {cases}"
     if proven := counts["proven_infeasible"]:
         what += f", {_many(proven, 'claim')} of infeasibility proven"
     if agreed:
@@ -185,11 +159,6 @@ def _headline(
         culprits = sorted({str(d["solver"]) for d in wrong})
         claims = _many(len(wrong), "claim")
         parts.append(f"{claims} refuted, of {some(culprits, 6)}")
-    if counts["unresolved"]:
-        parts.append(
-            f"{_many(counts['unresolved'], 'pair')} too far apart, with neither answer "
-            "refuted"
-        )
     if counts["contradictions"]:
         broken = _many(counts["contradictions"], "certificate")
         parts.append(f"{broken} contradicted by the reference")
@@ -236,24 +205,12 @@ def _about(x: Answer | Listed) -> dict[str, Any]:
     return {"run_id": x.run_id, "solver": x.solver, "case": x.case, "tol": x.tol}
 
 
-def _apart(p: Problem, pair: Pair) -> dict[str, Any]:
-    a, b = (p.answers[i] for i in (pair.a, pair.b))
-    return {
-        "problem": p.name,
-        "tol": a.tol,
-        "between": [f"{x.solver} on {x.form}" for x in (a, b)],
-        "run_ids": [a.run_id, b.run_id],
-        "distance": max(pair.distance, pair.equilibrium or 0.0),
-        "allowed": pair.allowed,
-    }
-
-
 def _remark(a: Answer, text: str) -> dict[str, Any]:
     return _about(a) | {"text": text, "error": a.error}
 
 
 def _problem(p: Problem) -> dict[str, Any]:
-    """Return a problem as plain data, in which pairs refer to answers by index."""
+    """Return a problem as plain data."""
     answers = [asdict(a) | {"error": a.error} for a in p.answers]
     data = {
         "name": p.name,
@@ -262,4 +219,5 @@ def _problem(p: Problem) -> dict[str, Any]:
         "closed": p.closed,
         "note": p.note,
     }
-    return data | {"answers": answers, "pairs": [pair._asdict() for pair in p.pairs]}
+    gaps = [d._asdict() for d in p.primal_dual]
+    return data | {"answers": answers, "primal_dual": gaps}

@@ -35,7 +35,7 @@ from mortarbench.harness.suite.suite import Suite, read_stored
 
 #: Folders and files that commands write to a result folder. ``--fresh`` deletes or
 #: overwrites only these, those in `_RESULT_FILES`, and copies of input files.
-_FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
+_FOLDERS = ("journal", "vectors", "cases", "environments", "report")
 _FILES = ("environment.json", "suite.toml")
 #: results of `mortarbench validate`, and faults of runs
 _RESULT_FILES = ("validation.json", FAULTS)

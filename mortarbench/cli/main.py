@@ -403,7 +403,7 @@ _COMMANDS = {
     ),
     "validate": _Command(
         "validate",
-        "compare the answers in a result folder with each other and with references",
+        "compare the answers in a result folder with reference solutions",
         [
             _RESULTS,
             _PLUGIN,

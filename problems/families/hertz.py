@@ -58,7 +58,6 @@ class HertzCylinder(ContactFamily):
         n=key(10, 1),
         m=key(8, 1),
         load=size(1.0),
-        radius=size(1.0),
         ratio=size(1.0),
         slave=choice("lower", "upper").with_default("upper"),
         contact=METHODS["contact"].with_default("mortar"),

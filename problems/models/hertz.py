@@ -83,7 +83,7 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
-RADIUS = 8e-3  #: radius R of the upper cylinder, m
+RADIUS = 8e-3  #: radius R of a cylinder, m
 NAMES = ("upper", "lower")
 MATERIAL = Material(E=200e9, nu=0.3)
 UNIT_LOAD = 1e6  #: unit of the key `load`, N/m
@@ -258,22 +258,19 @@ def _programme(
 def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
     """Return the cylinders, with n (upper) and m (lower) cells per half width a.
 
-    The upper cylinder has R = 8 mm and E = 200 GPa. The radius of the lower cylinder is
-    multiplied by `radius`, and its modulus by `ratio`. If Hertz's a exceeds a radius,
-    because the bodies are too soft for the theory, the mesh is that for a = radius, so
-    that the uniform part of the arc does not exceed the half disc.
+    Both cylinders have R = 8 mm. The upper one has E = 200 GPa; the modulus of the
+    lower one is multiplied by `ratio`. If Hertz's a exceeds R, because the bodies are
+    too soft for the theory, the mesh is that for a = R, so that the uniform part of the
+    arc does not exceed the half disc.
     """
     p: Any = params
     lower_material = Material(p["ratio"] * MATERIAL.E, MATERIAL.nu)
-    radius = p["radius"] * RADIUS
     compliance = _compliance(MATERIAL, p["plane"])
     compliance += _compliance(lower_material, p["plane"])
-    exact = LineContact(
-        p["load"] * UNIT_LOAD, 1 / (1 / RADIUS + 1 / radius), 1 / compliance
-    )
-    a, halvings = min(exact.a, RADIUS, radius), p["halvings"]
+    exact = LineContact(p["load"] * UNIT_LOAD, RADIUS / 2, 1 / compliance)
+    a, halvings = min(exact.a, RADIUS), p["halvings"]
     upper = _half_cylinder(RADIUS, a / p["n"], a, halvings).prefixed("upper_")
-    lower = _half_cylinder(-radius, a / p["m"], a, halvings).prefixed("lower_")
+    lower = _half_cylinder(-RADIUS, a / p["m"], a, halvings).prefixed("lower_")
     return HalfCylinders((upper, lower), (MATERIAL, lower_material), exact)
 
 

@@ -57,13 +57,13 @@ def compose(data: Data) -> Page:
             ("rules", "Rules of the verdict", TEXT.parts("rules")),
         )
     )
-    answers, solvers, cases, asked, pairs = (
+    answers, solvers, cases, asked = (
         plural(data["counts"][f"{noun}s"], noun)
-        for noun in ("answer", "solver", "case", "problem", "pair")
+        for noun in ("answer", "solver", "case", "problem")
     )
     return Page(
         title=f"Cross-validation of {clean(data['folder'])}",
-        dateline=f"{answers} of {solvers} to {cases} of {asked}; {pairs} compared",
+        dateline=f"{answers} of {solvers} to {cases} of {asked}",
         sections=tuple(s for s in sections if s is not None),
         footer=TEXT("footer"),
     )
@@ -72,7 +72,6 @@ def compose(data: Data) -> Page:
 def _verdict(data: Data) -> Iterator[Part]:
     rows = data["solvers"]
     tols = {row["tol"] for row in rows}
-    ours = any(row["from_ours"] is not None for row in rows)
     yield clean(data["headline"], 600)
     yield Table.of(
         TEXT("solvers", tols),
@@ -93,9 +92,8 @@ def _verdict(data: Data) -> Iterator[Part]:
             _column("balance", "balance", power),
             _column("rows", "contradicted_rows"),
             _column("primal against dual", "primal_dual", power),
-            *[_column("against smalbe", "from_ours", power)] * ours,
         ),
-        notes=(TEXT("last_columns", ours),),
+        notes=(TEXT("last_column"),),
     )
     answers = [a for p in data["problems"] for a in p["answers"]]
     tol = min((a["tol"] for a in answers), default=0.0)
@@ -128,7 +126,7 @@ def _worst_case(d: Data) -> Cell:
 
 
 def _disagreements(data: Data) -> Iterator[Part]:
-    """Tabulate refuted claims, and contradicting pairs without a refuted claim."""
+    """Tabulate refuted claims, and certificates that the reference contradicts."""
     if wrong := data["disagreements"]:
         yield Table.of(
             "Refuted claims, with our verdict and the reason.",
@@ -139,19 +137,6 @@ def _disagreements(data: Data) -> Iterator[Part]:
                 ("verdict", _judged),
                 _column("error", show=power),
                 ("reason", lambda d: Cell.words(clean(TEXT("why", d), 400))),
-            ),
-            text_columns=2,
-        )
-    if apart := data["unresolved"]:
-        yield Table.of(
-            "Pairs of answers that contradict each other although neither is refuted.",
-            apart,
-            (
-                ("problem", lambda d: Cell.name(d["problem"])),
-                ("between", lambda d: Cell.label(" and ".join(d["between"]), 120)),
-                _TOL,
-                _column("distance", show=power),
-                _column("allowed", show=power),
             ),
             text_columns=2,
         )
@@ -171,47 +156,38 @@ def _judged(d: Data) -> Cell:
 
 
 def _problems(data: Data) -> Iterator[Part]:
-    """Tabulate the largest distances between the answers to each problem."""
+    """Tabulate the largest errors of the answers to each problem."""
 
     def largest(name: str) -> Callable[[Data], Cell]:
         def cell(p: Data) -> Cell:
-            known = [pair[name] for pair in p["pairs"] if pair[name] is not None]
-            return Cell.power(max(known, default=None))
+            errors = [a["assessment"][name] for a in p["answers"] if a["assessment"]]
+            return Cell.power(max((e for e in errors if e is not None), default=None))
 
         return cell
 
-    def distance(pair: Data) -> float:
-        found = [pair[k] for k in ("distance", "equilibrium") if pair[k] is not None]
-        return max(found, default=float("inf"))
-
-    def between(p: Data) -> Cell:
-        farthest = max(p["pairs"], key=distance, default=None)
-        if farthest is None:
-            return Cell.words(ABSENT)
-        two = (p["answers"][farthest[k]] for k in ("a", "b"))
-        text = " and ".join(f"{a['solver']} on {a['form']}" for a in two)
-        return Cell.words(clean(text, 80))
+    def worst(p: Data) -> Cell:
+        known = [a for a in p["answers"] if a["error"] is not None]
+        a = max(known, key=lambda a: a["error"], default=None)
+        return Cell.words(clean(f"{a['solver']} on {a['form']}", 80) if a else ABSENT)
 
     def doubt(p: Data) -> Cell:
         truth = "" if p["truth"] == "reference" else clean(p["truth"] or "none", 40)
         return Cell.power(p["doubt"], after=truth)
 
     yield Table.of(
-        "Largest distances between the answers to each problem, over all pairs of "
-        "solvers and forms.",
+        "Largest errors of the answers to each problem, over all solvers and forms.",
         data["problems"],
         (
             ("problem", lambda p: Cell.name(p["name"])),
             ("answers", lambda p: Cell.number(len(p["answers"]))),
-            ("pairs", lambda p: Cell.number(len(p["pairs"]))),
             _column("closed rows", "closed"),
             ("error of the reference", doubt),
-            ("largest distance", largest("distance")),
-            ("of forces", largest("equilibrium")),
+            ("largest error", largest("error")),
+            ("of forces", largest("equilibrium_error")),
             ("of energies", largest("energy")),
-            ("between", between),
+            ("worst answer", worst),
         ),
-        notes=(TEXT("distances"),),
+        notes=(TEXT("errors_of_problems"),),
     )
 
 

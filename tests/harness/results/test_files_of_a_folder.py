@@ -238,7 +238,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
 ):
     names = kinds_of_files(folder_of_run)
     assert {name.partition("/")[0].partition(".")[0] for name in names} >= {
-        "journal", "vectors", "cases", "references", "report", "environments",
+        "journal", "vectors", "cases", "report", "environments",
         "environment", "suite", "faults", "validation", "", "files",
     }  # fmt: skip
     for i, name in enumerate(names):

@@ -168,10 +168,10 @@ def test_commands_read_nothing_outside_the_folder_for_malformed_digests(
 
 
 LINKS = (
-    "journal", "vectors", "cases", "references", "environments", "report", ".scratch",
+    "journal", "vectors", "cases", "environments", "report", ".scratch",
     "environment.json", "suite.toml", "validation.json", "validation.tmp", ".lock",
     "report/index.html", "report/report.md", "report/figures",
-    "report/tables/evil", "vectors/evil.npz", "references/evil.npz",
+    "report/tables/evil", "vectors/evil.npz",
 )  # fmt: skip
 
 

@@ -555,7 +555,7 @@ def test_another_suite_or_environment_is_refused_unless_fresh(measure, tmp_path)
     measure(suite("honest"))
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "validation.json").write_text("{}")  # a result of `validate`
-    (tmp_path / "references").mkdir()
+    (tmp_path / "report").mkdir()
 
     other = suite("zero", text='name = "other"\n')
     with pytest.raises(InputError, match=r"contains another suite .* --fresh"):
@@ -568,7 +568,7 @@ def test_another_suite_or_environment_is_refused_unless_fresh(measure, tmp_path)
     assert [r.solver for r in read_journal(tmp_path)] == ["zero"]
     assert (tmp_path / "notes.txt").read_text() == "mine"
     assert not (tmp_path / "validation.json").exists()
-    assert not (tmp_path / "references").exists()
+    assert not (tmp_path / "report").exists()
 
 
 def test_another_environment_is_refused_with_the_differences(measure):

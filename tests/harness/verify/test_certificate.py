@@ -289,26 +289,6 @@ def test_a_huge_error_is_relative_to_the_solution(name):
     assert found.bound * problem.exact.norm >= problem.error(-10 * s.x.astype(Real))
 
 
-def test_a_stored_reference_is_only_an_initial_guess(tmp_path):
-    mechanics = known(CASES[0]).mechanics
-    fresh = reference_point(mechanics, reference_solution, tmp_path)
-    (stored,) = tmp_path.iterdir()
-    wrong = (-1 - fresh.states).astype(np.int8)
-    forces = fresh.multipliers.astype(float)
-    for states, multipliers in (
-        (wrong, forces), (wrong[:3], forces), (wrong * 1.0, forces),
-        (5 + wrong, forces), (1 + 0 * wrong, forces), (fresh.states, -forces),
-        (fresh.states, 1e300 * forces), (fresh.states, forces * np.nan),
-    ):  # fmt: skip
-        with stored.open("wb") as file:
-            np.savez(file, states=states, multipliers=multipliers)
-        again = reference_point(mechanics, reference_solution, tmp_path)
-        assert (again.active == fresh.active).all()
-        assert again.bound < 1e-8
-    stored.write_bytes(b"PK")
-    assert reference_point(mechanics, reference_solution, tmp_path).bound < 1e-8
-
-
 def test_equal_points_are_certified_once_and_others_again(tmp_path, monkeypatch):
     calls = []
 

@@ -114,9 +114,9 @@ def test_two_cylinders_are_in_hertz_contact_by_mortar(contact, basis, slave):
 
 
 @pytest.mark.parametrize(("contact", "basis"), PAIRINGS)
-def test_unequal_cylinders_are_in_hertz_contact(contact, basis):
-    """The radii are 8 mm and 16 mm, and the ratio of the moduli is 10."""
-    got = result(CYLINDER, contact=contact, basis=basis, radius=2.0, ratio=10.0)
+def test_cylinders_of_unequal_materials_are_in_hertz_contact(contact, basis):
+    """The ratio of the moduli is 10."""
+    got = result(CYLINDER, contact=contact, basis=basis, ratio=10.0)
 
     assert abs(got["p_max_error"]) <= 0.01
     assert got["pressure_l2_error"] <= 0.05
@@ -124,16 +124,14 @@ def test_unequal_cylinders_are_in_hertz_contact(contact, basis):
 
 
 def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
-    """Three pairs of cylinders are compared with closed forms, among them a cylinder on
-    a nearly rigid plane."""
-    theory = [
+    """The bodies are two equal cylinders, and a cylinder on one of half the modulus."""
+    equal, softer = (
         two_cylinders({**CYLINDER.defaults, "load": 10.0, **keys})[1]
-        for keys in ({}, {"ratio": 1e9, "radius": 1e9}, {"radius": 3.0, "ratio": 0.5})
-    ]
+        for keys in ({}, {"ratio": 0.5})
+    )
 
-    assert theory[0].a == pytest.approx(BENCHMARK.a)
-    assert theory[1].p0 == pytest.approx(BENCHMARK.p0)
-    assert (theory[2].R, theory[2].E_star) == pytest.approx((6e-3, 200e9 / 0.91 / 3))
+    assert equal.a == pytest.approx(BENCHMARK.a)
+    assert (softer.R, softer.E_star) == pytest.approx((4e-3, 200e9 / 0.91 / 3))
 
 
 @pytest.mark.slow
@@ -177,7 +175,7 @@ def test_errors_on_fine_meshes_are_those_of_finite_bodies(n):
         (PLANE, {"n": 0}, "hertz-plane: n=0 must be at least 1"),
         (PLANE, {"load": -1.0}, "hertz-plane: load=-1.0 must be positive"),
         (CYLINDER, {"m": 0}, "hertz-cylinder: m=0 must be at least 1"),
-        (CYLINDER, {"radius": 0.0}, "hertz-cylinder: radius=0.0 must be positive"),
+        (CYLINDER, {"ratio": 0.0}, "hertz-cylinder: ratio=0.0 must be positive"),
         (CYLINDER, {"contact": "glue"}, "contact='glue' is unknown"),
     ],
 )
