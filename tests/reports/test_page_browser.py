@@ -267,21 +267,21 @@ def test_a_filter_shows_exactly_the_matching_rows(visit, folder, records):
 
 def test_the_verdict_filter_shows_exactly_the_matching_cases(visit, folder, records):
     page = visit(folder)
-    page.select_option("#verdict", "wrong")
-    wanted = set(names(records, verdict=Verdict.WRONG))
+    page.select_option("#verdict", "inaccurate")
+    wanted = set(names(records, verdict=Verdict.INACCURATE))
     assert 0 < len(wanted) < 50
     assert set(column(table(page, "verdicts"), "case")) == wanted
     assert set(column(table(page, "cases"), "case")) == wanted
     errors = table(page, "errors")
     found = zip(column(errors, "case"), column(errors, "solver"), strict=True)
     assert set(found) == {
-        (r.case, r.solver) for r in records if r.verdict is Verdict.WRONG
+        (r.case, r.solver) for r in records if r.verdict is Verdict.INACCURATE
     }
-    toggle(page, "solver-a")  # rows with wrong answers of a are hidden
+    toggle(page, "solver-a")  # rows with inaccurate answers of a are hidden
     wanted = {
         r.case
         for r in records
-        if r.verdict is Verdict.WRONG and r.solver != "solver-a"
+        if r.verdict is Verdict.INACCURATE and r.solver != "solver-a"
     }  # fmt: skip
     assert set(column(table(page, "verdicts"), "case")) == wanted
 

@@ -200,7 +200,7 @@ def test_points_of_a_sweep_name_the_measurement_at_their_tolerance(certified):
     for o in found.flat:
         row.setdefault(o.solver, []).append(o)
     if certified:
-        figure = certified_figure([("c", row)], found.solvers, {})
+        figure = certified_figure([("c", row)], found.solvers)
     else:
         figure = sweep_figure([("c", row)], found.solvers)
 
