@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from html import escape
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from mortarbench.harness.conformance.conformance import (
 from mortarbench.harness.crossval.comparison import brief
 from mortarbench.harness.crossval.summary import as_data
 from mortarbench.harness.crossval.validation import validate_folder
-from mortarbench.harness.errors import InputError, some, unknown
+from mortarbench.harness.errors import InputError, shown, some, unknown
 from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.measurement import scratch_folder
@@ -63,6 +64,7 @@ class Validation:
 def validate(
     folder: str | Path,
     *,
+    budget: float = inf,
     plugins: Plugins = (),
     progress: Callable[[str], None] = ignore,
     registries: Registries | None = None,
@@ -74,6 +76,7 @@ def validate(
     Parameters
     ----------
     folder : result folder, as `run` writes it
+    budget : time in s after which no further case is begun
     plugins : Python files with more solvers or families
     progress : called with messages about the progress
     registries : used instead of built-in registries, installed plug-ins and `plugins`
@@ -93,9 +96,11 @@ def validate(
     """
     path = checked.path("folder", folder)
     checked.function("progress", progress)
+    if not checked.is_number(budget) or not budget >= 0:  # `not ≥` also rejects NaN
+        raise InputError(f"budget = {shown(budget)}; expected a number of seconds ≥ 0")
     registries = load_registries(plugins, registries)
     families = registries.families_with_copies(path)
-    result = validate_folder(path, families, registries.reference, progress)
+    result = validate_folder(path, families, registries.reference, progress, budget)
     data = as_data(result, path.resolve().name)
     if not (data["counts"]["answers"] or result.false_claims or result.proven):
         reasons = [entry.text for entry in result.not_validated]

@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
+from time import monotonic
 from typing import NamedTuple
 
 from mortarbench.harness.crossval.comparison import (
@@ -99,11 +101,13 @@ def validate_folder(
     families: Mapping[str, Family],
     reference: Reference,
     tell: Callable[[str], None],
+    budget: float = inf,
 ) -> Validation:
     """Assess all answers of a result folder.
 
     reference : function that solves a QP accurately, independent of the solvers under
         test
+    budget : time in s after which no further case is begun
     tell : progress callback, called with the name and the number of each case before
         the case is assessed
 
@@ -121,8 +125,12 @@ def validate_folder(
         raise InputError(f"{path}: {_pointless(records)}")
     folder = _Folder(path=path, families=families, reference=reference)
     parts: list[_Part] = []
-    groups = _groups(records)
+    groups, begun = _groups(records), monotonic()
     for number, (name, group) in enumerate(groups.items(), 1):
+        if parts and monotonic() - begun > budget:
+            text = f"not begun within the budget of {budget:g} s"
+            parts.append(_Part([], [_listed(r, text) for r in group], [], 0))
+            continue
         tell(f"{name} ({number} of {len(groups)})")
         parts.append(_group(folder, name, group))
     false_claims = [claim for part in parts for claim in part.false]

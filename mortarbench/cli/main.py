@@ -18,6 +18,7 @@ from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -406,6 +407,12 @@ _COMMANDS = {
         "compare the answers in a result folder with reference solutions",
         [
             _RESULTS,
+            _Option(
+                "--budget",
+                "SECONDS",
+                "time after which no further case is begun; default: no limit",
+                {"default": inf},
+            ),
             _PLUGIN,
             _JSON,
         ],

@@ -17,7 +17,9 @@ def run(registries: Registries, options: Namespace) -> int:
 
     from mortarbench.validation import validate
 
-    result = validate(options.folder, progress=say, registries=registries)
+    result = validate(
+        options.folder, budget=options.budget, progress=say, registries=registries
+    )
     if options.json:
         print(json.dumps(result.to_dict(), allow_nan=False))
     else:

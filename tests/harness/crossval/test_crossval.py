@@ -191,6 +191,18 @@ def test_the_answer_to_the_step_before_is_refuted(truths, tmp_path, cli):
     assert wrong["error"] > 0.1
 
 
+def test_cases_that_a_budget_excludes_are_listed(truths, tmp_path, cli):
+    answers = [
+        ("a", f"{BEAM}/step={step}/dual", truths[step, "dual"][1]) for step in (1, 2)
+    ]
+    code, verdict = verdict_on(cli, write(tmp_path, answers), "--budget", 0)
+
+    assert code == 0
+    assert verdict["counts"]["answers"] == 1
+    (left,) = verdict["not_validated"]
+    assert "not begun within the budget of 0 s" in json.dumps(left)
+
+
 def test_rows_closed_in_the_reference_and_open_in_an_answer_are_listed(truths):
     case, s = truths[2, "dual-bounds"]
     back, nothing = case.mechanics.to_primal, replace(s, x=np.zeros_like(s.x))
