@@ -93,8 +93,8 @@ class TornDual:
         """
         B, T, f = self.torn.rows.B, self.torn.spread, self.torn.f
         v = self.served.lead("domains.inverse", f - B.T @ s.x) - self.R @ s.y
-        squares = csr_array((T.data**2, T.indices, T.indptr), T.shape)
-        copies = squares.T @ np.ones(v.size)
+        component = self.torn.component[self.torn.free]
+        copies = np.bincount(component, minlength=T.shape[1])
         return np.asarray((T.T @ v) / np.maximum(copies, 1))
 
     def multipliers(self, s: Solution) -> Vector:

@@ -233,6 +233,10 @@ class Subdomains:
 
     def kernel(self) -> csr_array:
         """Return R = diag(R_1 … R_S) (N, r), the rigid motions of all subdomains."""
+        return self._kernel
+
+    @cached_property
+    def _kernel(self) -> csr_array:
         blocks = self.comm.gather({k: self.template(k).R for k, _ in self.own})
         motions, sizes = np.diff(self.motions), np.diff(self.start)
         if not blocks:

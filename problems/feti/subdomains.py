@@ -252,7 +252,7 @@ class TornBodies:
             return self
         return self.with_problem(replace(self.problem, eliminated=False))
 
-    @property
+    @cached_property
     def f(self) -> Vector:
         """Torn load (N,) in subdomain axes; copies of a node have equal shares."""
         d = self.problem.components
