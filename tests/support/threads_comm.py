@@ -149,6 +149,7 @@ def unlock(patch: pytest.MonkeyPatch) -> None:
     """
     for owner, name in (
         (Subdomains, "motions"),
+        (Subdomains, "_kernel"),
         (DualOperator, "linear_map"),
         (DualOperator, "_blocks"),
         (DualOperator, "_diagonal"),
