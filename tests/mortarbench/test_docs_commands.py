@@ -119,6 +119,7 @@ ELSEWHERE = {
     "mortarbench run ranks": "test_ranks.py, a smaller suite of ranks",
     "mortarbench run fleet --dask tls://login1:8786": "test_cluster_tls.py",
     "python cluster.py": "it submits jobs to a batch system",
+    "python benchmarks/ranks.py": "a measurement of minutes, in a checkout",
     "mortarbench run fleet --out out/fleet --dask tcp://login1:PORT": "the same",
     "mortarbench solve bodies:press.toml/parts=20/glue=redundant/dual "
     "--solver smalbe": "test_subdomains.py; the file is that of own-geometry.md",
