@@ -56,22 +56,6 @@ class Preconditioned(Protocol):
 
 
 @runtime_checkable
-class WithDiagonal(Protocol):
-    """A product x ↦ Px with a method that returns the diagonal of P.
-
-    A maker may return such a product. Pᵢᵢ scales the residual of component i. Without
-    the diagonal, scales may be smaller, and the verdict stricter, than for a matrix
-    (`harness.verify.kkt`).
-    """
-
-    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return Px for x of shape (n,) or (n, k)."""
-
-    def diagonal(self) -> NDArray[np.float64]:
-        """Return the diagonal entries Pᵢᵢ (n,)."""
-
-
-@runtime_checkable
 class Compiled(Protocol):
     """A product x ↦ Px that compiled solvers can apply without calling Python."""
 

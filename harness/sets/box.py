@@ -39,9 +39,7 @@ class Box:
     @property
     def block(self) -> NDArray[np.int64]:
         """Indices of the variables with a finite bound, in ascending order."""
-        is_bounded = np.isfinite(self.lower) | np.isfinite(self.upper)
-        # np.asarray returns the local slice of a distributed vector
-        return np.flatnonzero(np.asarray(is_bounded))
+        return np.flatnonzero(np.isfinite(self.lower) | np.isfinite(self.upper))
 
     def check(self, n: int) -> None:
         """Raise ValueError if bounds have a wrong shape, are NaN or exclude all x."""
