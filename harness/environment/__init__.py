@@ -1,1 +1,1 @@
-"""Machine and software of a measurement: description, checks and noise floor."""
+"""Machine and software of a measurement: description and checks."""

@@ -36,25 +36,16 @@ THREAD_VARIABLES = (
     "RAYON_NUM_THREADS",
 )  # fmt: skip
 
-#: Beginnings of the file names of libraries that contain a BLAS. libblas is last, since
-#: wrappers of an optimised BLAS have the same name as the reference BLAS.
-BLAS_LIBRARIES = (
-    ("libopenblas", "OpenBLAS"), ("libmkl", "MKL"), ("libblis", "BLIS"),
-    ("libflexiblas", "FlexiBLAS"), ("libatlas", "ATLAS"), ("libsatlas", "ATLAS"),
-    ("libblas", "reference BLAS"),
-)  # fmt: skip
 #: owners of libraries whose thread pools the code of mortarbench may use: the operating
 #: system, or the wheel of a package
 OWNERS = ("system", "numpy", "scipy", "scikit_sparse")
-#: owners of libraries that CHOLMOD may use
-CHOLMOD_OWNERS = ("system", "scikit_sparse")
 
+REFERENCE_BLAS = "reference BLAS"
 VOLATILE = ("now",)  #: keys of an environment that its digest excludes
 
 #: folders of a checkout that contain code
 _CODE = ("harness", "problems", "solvers", "reports", "mortarbench")
 _CPU = Path("/sys/devices/system/cpu")
-_CGROUP = Path("/sys/fs/cgroup")
 
 
 def capture(
@@ -77,10 +68,10 @@ def capture(
         (p for p in map(_pool, threadpool_info()) if p["owner"] in OWNERS),
         key=lambda p: (p["library"], p["owner"]),
     )
-    mapped = mapped_libraries()
+    maps = _read(Path("/proc/self/maps"))
+    cholmod = re.search(r"/libcholmod[^/]*\.so\.([\d.]+)$", maps, re.M)
     cores = set(zip(_cpuinfo("physical id"), _cpuinfo("core id"), strict=False))
     governors = {_read(f) for f in _CPU.glob("cpu[0-9]*/cpufreq/scaling_governor")}
-    governors.discard("")
     return {
         "machine": {
             "cpu": next(iter(_cpuinfo("model name")), None),
@@ -94,7 +85,7 @@ def capture(
             "kernel": platform.release(),
             "libc": " ".join(platform.libc_ver()).strip() or None,
             "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
-            "governor": ", ".join(sorted(governors)) or None,  # governors of all CPUs
+            "governor": ", ".join(sorted(governors - {""})) or None,
             "turbo": _turbo(),
             "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
         },
@@ -109,8 +100,8 @@ def capture(
             "pools": pools,
         },
         "cholmod": {
-            "version": cholmod_version(mapped),
-            "blas": system_blas(mapped, pools),
+            "version": cholmod[1] if cholmod else None,
+            "blas": cholmod_blas(pools, maps),
         },
         "now": {
             "time": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -198,53 +189,20 @@ def source(root: Path) -> dict[str, Any] | None:
     return {"commit": commit, "dirty": True, "changes": hex_digest(changes)}
 
 
-def mapped_libraries() -> list[str]:
-    """Return the paths of the files mapped by this process; [] if unknown."""
-    lines = _read(Path("/proc/self/maps")).splitlines()
-    return sorted({line.split(maxsplit=5)[5] for line in lines if " /" in line})
+def cholmod_blas(pools: Iterable[Mapping[str, Any]], maps: str) -> str | None:
+    """Return the BLAS that CHOLMOD uses, such as "libopenblas 0.3.21 pthreads".
 
+    CHOLMOD calls the BLAS of the operating system or of its own wheel, not a BLAS in
+    the wheel of another package. The reference BLAS has no thread pool. A libblas
+    beside an optimised BLAS is a wrapper of the latter (alternatives of Debian).
 
-def system_blas(
-    mapped: Iterable[str], pools: Iterable[Mapping[str, Any]]
-) -> str | None:
-    """Return the BLAS that CHOLMOD uses, such as "OpenBLAS 0.3.21 (pthreads)".
-
-    CHOLMOD does not call a BLAS in the wheel of another package. Libraries in
-    site-packages are therefore ignored, except the libraries of scikit-sparse. A system
-    library libblas is the reference BLAS only if no optimised BLAS is loaded, because
-    in the alternatives system of Debian libblas.so.3 may be a wrapper of OpenBLAS or
-    MKL.
-
-    mapped : absolute paths of loaded libraries, see `mapped_libraries`
     pools : entries ``threads.pools`` of `capture`
+    maps : content of /proc/self/maps
     """
-    names = {Path(file).name for file in mapped if not _in_foreign_wheel(file)}
-    for stem, title in BLAS_LIBRARIES:
-        if any(name.startswith(stem) for name in names):
-            for pool in pools:
-                if pool["library"].startswith(stem) and pool["owner"] in CHOLMOD_OWNERS:
-                    layer = f"({pool['layer']})" if pool["layer"] else None
-                    return " ".join(filter(None, (title, pool["version"], layer)))
-            return title
-    return None
-
-
-def cholmod_version(mapped: Iterable[str]) -> str | None:
-    """Return the version of CHOLMOD from the file name of its library, or None.
-
-    mapped : absolute paths of loaded libraries, see `mapped_libraries`
-    """
-    for path in mapped:
-        if name := re.search(r"/libcholmod[^/]*\.so\.([\d.]+)$", path):
-            return name[1]
-    return None
-
-
-def _in_foreign_wheel(path: str) -> bool:
-    package = re.search(r"/(?:site|dist)-packages/([^/]+)", path)
-    return package is not None and not package[1].startswith(
-        ("scikit_sparse", "sksparse")
-    )
+    for pool in pools:
+        if pool["owner"] in ("system", "scikit_sparse") and pool["layer"]:
+            return f"{pool['library']} {pool['version']} {pool['layer']}"
+    return REFERENCE_BLAS if re.search(r"/libblas[^/]*$", maps, re.M) else None
 
 
 def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
@@ -280,11 +238,8 @@ def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
 
 def _cpu_limit() -> float | None:
     """Return the container's CPU limit, in cores; None if unlimited or unknown."""
-    quota, period = ([*_read(_CGROUP / "cpu.max").split(), "", ""])[:2]
-    if not quota:  # control groups of version 1
-        quota = _read(_CGROUP / "cpu/cpu.cfs_quota_us")
-        period = _read(_CGROUP / "cpu/cpu.cfs_period_us")
-    return int(quota) / int(period) if quota.isdigit() and period.isdigit() else None
+    limit = re.match(r"(\d+) (\d+)", _read(Path("/sys/fs/cgroup/cpu.max")))
+    return int(limit[1]) / int(limit[2]) if limit else None
 
 
 def _turbo() -> bool | None:

@@ -14,12 +14,11 @@ def run(registries: Registries, options: Namespace) -> int:
 
     from mortarbench.harness.environment.doctor import as_json, examine, render
     from mortarbench.harness.environment.environment import digest
-    from mortarbench.harness.environment.noise import noise_floor
 
-    environment, noise = registries.environment(), noise_floor()
-    checks = examine(environment, noise)
+    environment = registries.environment()
+    checks = examine(environment)
     if options.json:
-        print(json.dumps(as_json(environment, noise, checks)))
+        print(json.dumps(as_json(environment, checks)))
     else:
         text = render(checks, digest(environment))
         Console(highlight=False, soft_wrap=True).print(text)

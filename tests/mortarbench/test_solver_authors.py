@@ -115,7 +115,7 @@ def test_two_versions_are_measured_in_one_run_and_block(cli, versions, tmp_path)
     (tmp_path / "old" / "step.py").write_text("LENGTH = 3")
     code, _, err = cli("run", "mine.toml", *versions)
     assert code == 2
-    assert "content of the plug-in old=mine.py: " in err
+    assert "plugins.old=mine.py: " in err
 
 
 def test_the_error_for_versions_without_labels_mentions_labels(cli, versions):

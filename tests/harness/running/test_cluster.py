@@ -513,13 +513,13 @@ def test_another_environment_is_stored_with_one_warning(meet):
     cpu = capture()["machine"]["cpu"]
     assert said[0].startswith(
         "node07 measures under different conditions from this machine "
-        f"(processor: {cpu} here, Another there); "
+        f"(machine.cpu: {cpu} here, Another there); "
     )
 
 
 def test_workers_that_share_a_machine_are_named_in_the_warning(meet):
     _, said = meet(lambda there: there["machine"].update(shared_by_workers=2))
-    assert "(Dask workers that share the machine: none here, 2 there)" in said[0]
+    assert "(machine.shared_by_workers: None here, 2 there)" in said[0]
 
 
 @pytest.mark.parametrize(
