@@ -15,7 +15,6 @@ from .plugin import Fields as Fields
 from .plugin import Reference as Reference
 from .plugin import ReferenceOfOperator as ReferenceOfOperator
 from .plugin import Solver as Solver
-from .plugin import Tightening as Tightening
 from .plugin import Value as Value
 from .qp import QP as QP
 from .qp import Matrix as Matrix

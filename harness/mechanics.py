@@ -122,9 +122,6 @@ class Friction:
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
     cohesion: Vector  #: (k,) part of the bound that does not depend on λ_n, a force
     mu: Vector  #: (k,) coefficient of friction
-    #: `residual` at the solution of the problem with this bound; 0 if it was not
-    #: computed, or if the fixed-point iteration has converged
-    unsettled: float = 0.0
 
     @property
     def tangents(self) -> int:
@@ -168,8 +165,7 @@ class Friction:
 
     def __getitem__(self, selected: NDArray[Any]) -> Friction:
         """Return the friction of the selected rows, given by indices or a mask."""
-        rows = {k: v[selected] for k, v in vars(self).items() if k != "unsettled"}
-        return replace(self, **rows)
+        return replace(self, **{k: v[selected] for k, v in vars(self).items()})
 
 
 def friction_discs(bound: Vector, tangents: int, first: int) -> Discs:

@@ -106,17 +106,6 @@ class Chained(Solver, Protocol):
         """
 
 
-class Tightening(Chained, Protocol):
-    """A solver that can reuse work in a sequence whose QPs differ in tolerance."""
-
-    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
-        """Begin a sequence, and return a `prepare` function for its QPs.
-
-        The returned function takes a QP and its tolerance, since early QPs of a
-        fixed-point iteration need not be solved as accurately as the last one.
-        """
-
-
 @dataclass(frozen=True, kw_only=True)
 class About:
     """Description of a solver, for lists and reports.
@@ -268,10 +257,6 @@ class Case:
     #: number of ranks; empty to compute it from the coefficients
     digest: str = ""
     remarks: tuple[str, ...] = ()  #: warnings about the input; each is a single line
-    #: relative residual of the fixed-point iteration to which the QP belongs, such as
-    #: the iteration for Coulomb's law. An accurate solution of this QP does not reduce
-    #: the residual. 0 if there is no iteration
-    unsettled: float = 0.0
 
 
 class CaseOnRanks(NamedTuple):

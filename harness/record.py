@@ -25,7 +25,6 @@ SCHEMA = 3
 #: An answer counts as verified if its residuals are at most this multiple of the
 #: tolerance.
 VERIFIED_FACTOR = 10.0
-TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
 LARGEST_INTEGER = 2**63 - 1  #: largest integer that 64-bit formats (Parquet) can store
 #: smallest and largest valid measured time in s; 0 is also valid
 SECONDS = (1e-12, 1e10)
@@ -166,13 +165,8 @@ class Record(Measurement):
     threads: int | None = None  #: largest thread count of any library in the worker
     cpu: int | None = None  #: number of the CPU to which the worker was bound
     ranks: int = 1  #: number of MPI processes of the solve
-    #: "cold" for a single case; "sequence" if results of earlier steps may be reused;
-    #: "sequence, tighten=θ" for a sequence with tightening tolerances, see
-    #: `Record.tighten`
+    #: "cold" for a single case; "sequence" if results of earlier steps may be reused
     mode: str = "cold"
-    #: tolerance of an early step of a tightening sequence; None if the tolerance is
-    #: `tol`
-    step_tol: float | None = None
     #: tolerance of the verdict if it differs from `tol`, as in accuracy sweeps; else
     #: None
     accuracy: float | None = None
@@ -210,25 +204,9 @@ class Record(Measurement):
         return f"{self.session}-{self.run_id}" if self.session else self.run_id
 
     @property
-    def tighten(self) -> float:
-        """Factor θ of a tightening sequence; 0 for other modes.
-
-        Each step of a tightening sequence is solved to the tolerance max(tol,
-        min(θ·`unsettled`, 1e-2)), where `unsettled` is an attribute of
-        `harness.plugin.Case`.
-        """
-        _, _, number = self.mode.partition(TIGHTENING)
-        return float(number or 0)
-
-    @property
-    def asked_tol(self) -> float:
-        """Tolerance that was passed to the solver."""
-        return self.tol if self.step_tol is None else self.step_tol
-
-    @property
     def judged_at(self) -> float:
         """Tolerance on which the verdict is based."""
-        return self.asked_tol if self.accuracy is None else self.accuracy
+        return self.tol if self.accuracy is None else self.accuracy
 
     @property
     def claims_answer(self) -> bool:
@@ -405,18 +383,9 @@ def _check(r: Record) -> None:
         raise ValueError(_WRONG_SCHEMA)
     if not r.run_id:
         raise ValueError("run_id is empty; expected a nonempty string")
-    for name, at in (
-        ("tol", r.tol),
-        ("accuracy", r.accuracy),
-        ("step_tol", r.step_tol),
-    ):
+    for name, at in (("tol", r.tol), ("accuracy", r.accuracy)):
         if at is not None and not 0 < at <= 1:
             raise ValueError(f"{name} = {at!r}; expected a number above 0, at most 1")
-    theta = r.mode.removeprefix(TIGHTENING)
-    if theta != r.mode and not re.fullmatch(r"0\.[0-9]+|[0-9.]+e-[0-9]+", theta):
-        raise ValueError(
-            f"mode = {shown(r.mode)}; expected '{TIGHTENING}θ' with θ between 0 and 1"
-        )
     numbers = [n for n in _not_negative(r) if n]
     if numbers and not 0 < min(numbers) <= max(numbers) <= LARGEST_INTEGER:
         for name, value in zip(_NOT_NEGATIVE, _not_negative(r), strict=True):

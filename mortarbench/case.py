@@ -94,11 +94,6 @@ class Case(plugin.Case):
         """Mechanical problem from which error bounds are computed, or None."""
         return self.family_case.mechanics
 
-    @property
-    def unsettled(self) -> float:
-        """Relative residual of a fixed-point iteration; 0 for a QP outside of one."""
-        return self.family_case.unsettled
-
     def recover(self, solution: Solution) -> Vector:
         """Recover the physical unknown, such as displacements, in SI units."""
         return self.family_case.recover(solution)

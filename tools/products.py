@@ -7,7 +7,7 @@ column begins with a case name in backquotes, in which ``key=1..24`` denotes a s
 of cases. With several keys of this type, the last key varies fastest. The heading of a
 measured column begins with a solver in backquotes (possibly with options ``key=value``)
 or with ``best preset``, followed by the tolerance. If the solver reuses earlier results
-in a sequence, ``warm`` or ``tightened`` follows. Other columns are left unchanged.
+in a sequence, ``warm`` follows. Other columns are left unchanged.
 """
 
 from __future__ import annotations
@@ -28,11 +28,7 @@ from mortarbench.solvers import SOLVERS
 
 PAGE = Path(__file__).parents[1] / "docs" / "smalbe-products.md"
 PRESETS = ("smalbe-permon", "smalbe-espreso")
-#: tolerance of a tightened step relative to the distance from the fixed point, as in
-#: suites/fixed-point.toml
-THETA = 0.1
-LOOSEST = 1e-2  #: largest tolerance of a tightened step
-HEAD = re.compile(r"(?:`([^`]+)`|best preset) (1e-\d+)(?: (warm|tightened))?")
+HEAD = re.compile(r"(?:`([^`]+)`|best preset) (1e-\d+)(?: (warm))?")
 CASE = re.compile(r"`([\w-]+/[^`]*)`")
 SEQUENCE = re.compile(r"(\w+)=(\d+)\.\.(\d+)")
 
@@ -89,15 +85,13 @@ def _spent(sequence: str, text: str, tol: float, mode: str) -> int:
     options = dict(pair.split("=", 1) for pair in pairs)
     flags = {"true": True, "false": False}
     solver = replace(SOLVERS[name], **{k: flags.get(v, v) for k, v in options.items()})
-    chain = solver.tightening() if mode else None
+    chain = solver.chain(tol) if mode else None
     spent = 0
     for case in _cases(sequence):
-        worth = min(LOOSEST, THETA * case.unsettled) if mode == "tightened" else 0.0
-        asked = max(tol, worth)
-        solve = chain(case.qp, asked) if chain else solver.prepare(case.qp, asked)
+        solve = chain(case.qp) if chain else solver.prepare(case.qp, tol)
         answer: Solution = solve()
-        if not kkt_residuals(case.qp, answer).worst <= VERIFIED_FACTOR * asked:
-            raise ValueError(f"{sequence}: {text} is not verified at {asked:g}")
+        if not kkt_residuals(case.qp, answer).worst <= VERIFIED_FACTOR * tol:
+            raise ValueError(f"{sequence}: {text} is not verified at {tol:g}")
         spent += answer.counts["P_products"]
     return spent
 

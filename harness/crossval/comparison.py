@@ -144,7 +144,7 @@ def _answer(
     g: StoredAnswer, assessment: Assessment | None, doubt: float | None
 ) -> Answer:
     """Determine the verdict on one answer, and the reasons why its claim is false."""
-    r, residuals, tol = g.record, residuals_of(g), g.record.asked_tol
+    r, residuals, tol = g.record, residuals_of(g), g.record.tol
     answer = Answer(
         run_id=r.identity,
         repeats=g.repeats,

@@ -88,7 +88,7 @@ def ground_truth_of(
     def assessed(g: StoredAnswer) -> tuple[Assessment, Vector]:
         assert g.case.mechanics is not None
         at = g.case.mechanics.to_primal(g.solution)
-        return assess(mechanics, point, at, g.record.asked_tol)
+        return assess(mechanics, point, at, g.record.tol)
 
     exact = mechanics.exact
     contact = exact.contact

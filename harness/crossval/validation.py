@@ -273,7 +273,7 @@ def _stored_answers(
             r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
         ):
             continue
-        key = (r.solver, r.case, r.asked_tol, r.vectors)
+        key = (r.solver, r.case, r.tol, r.vectors)
         if key in answers:
             repeats = answers[key].repeats + 1
             answers[key] = replace(answers[key], repeats=repeats)

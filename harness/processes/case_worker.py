@@ -192,7 +192,6 @@ class CaseWorker:
             "build_seconds": self._build_seconds,
             "dualise_seconds": case.dualise_seconds,
             "build_peak_mib": self._build_peak_mib,
-            "unsettled": case.unsettled,
         }
         return {"meta": {**meta, **seconds, "qp": digest}}
 

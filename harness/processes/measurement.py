@@ -92,7 +92,7 @@ def measure_and_judge(
         lost.
 
     """
-    request = {**request, "tol": record.asked_tol, "judged_at": record.judged_at}
+    request = {**request, "tol": record.tol, "judged_at": record.judged_at}
     if not isinf(memory_limit):
         request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -10,9 +10,8 @@ answers three kinds of requests:
   - ``digest``: digest of the file, which is checked; without a digest, QPs with an
     operator are refused,
   - ``memory_limit``: limit in MiB,
-  - ``once``: true for a single solve, which is timed,
-  - ``step``: index 0, 1, … of the QP in a sequence, and
-  - ``tightens``: true if each step of the sequence has its own tolerance
+  - ``once``: true for a single solve, which is timed, and
+  - ``step``: index 0, 1, … of the QP in a sequence
 
 * ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: build a case on the MPI ranks
   (`harness.plugin.Family.on_ranks`), measure, and write the point to ``out``. If the
@@ -36,7 +35,6 @@ import resource
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +56,7 @@ from mortarbench.harness.processes.protocol import (
 from mortarbench.harness.processes.ranks import Build, RanksAsOne, this_rank
 from mortarbench.harness.qp import QP, no_rows
 from mortarbench.harness.record import finite, journal_name
-from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import (
     DeclinedError,
     Prepare,
@@ -107,7 +105,7 @@ class _SolverHost:
     def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
         self._solver = solver
         self._operators = operators
-        self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
+        self._chain: Prepare | None = None
         self._last_step = -1  # index of the last measured step of the sequence
         # inode, size and modification time of each verified file, by the digest of its
         # content
@@ -219,46 +217,23 @@ class _SolverHost:
         treats each step as an independent QP.
         """
         step = request.get("step")
-        if step is None or not hasattr(self._solver, "chain"):
+        begin = getattr(self._solver, "chain", None)
+        if step is None or begin is None:
             return None
         if step and self._last_step != step - 1:
             raise LookupError("the process with the earlier steps has ended")
         self._last_step, tol = step, request["tol"]
         if step == 0:
             self._chain = None
-        begin = partial(
-            _begin_sequence, self._solver, tightens=request.get("tightens", False)
-        )
 
         def prepare(qp: QP) -> Callable[[], Solution]:
             # Begin the sequence here, so that its time is included in the time of
             # `prepare`.
             if self._chain is None:
                 self._chain = begin(tol)
-            return self._chain(qp, tol)
+            return self._chain(qp)
 
         return prepare
-
-
-def _begin_sequence(
-    solver: Any, tol: float, *, tightens: bool
-) -> Callable[[QP, float], Callable[[], Solution]]:
-    """Return the `prepare` function of a sequence, called with each QP and tolerance.
-
-    tightens : True if each step has its own tolerance; if the solver does not support
-        varying tolerances, every step is declined
-    """
-    if not tightens:
-        fixed: Prepare = solver.chain(tol)
-        return lambda qp, tol: fixed(qp)
-    if hasattr(solver, "tightening"):
-        varying: Callable[[QP, float], Callable[[], Solution]] = solver.tightening()
-        return varying
-    why = (
-        "chain() uses one tolerance for all steps; expected tightening() for several "
-        "tolerances"
-    )
-    return lambda qp, tol: partial(Solution.without_point, qp, Status.DECLINED, why)
 
 
 def _one_thread() -> int:

@@ -33,9 +33,6 @@ from mortarbench.harness.results.work_unit import (
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.verdicts import has_point, noted
 
-#: largest tolerance of a step, which applies far from the fixed point
-MAX_STEP_TOL = 1e-2
-
 
 @dataclass(eq=False)
 class Executor:
@@ -189,7 +186,6 @@ class Executor:
             "out": str(self._point),
             "source": source,
             **({"step": step} if block.is_sequence else {}),
-            **({"tightens": True} if record.tighten else {}),
         }
         if source.is_shared:
             request |= case_request(record)
@@ -207,7 +203,7 @@ class Executor:
         if block.warm_up is not None:
             keys.append("build_peak_mib")
         meta = {key: entry.meta.get(key) for key in keys}
-        return request, record.replace(**meta, step_tol=_step_tol(record, entry))
+        return request, record.replace(**meta)
 
     def _source(self, record: Record) -> Source:
         """Return the origin of a record's QP."""
@@ -350,20 +346,6 @@ def local_engine(
     """Open the engine for one machine, which executes the blocks sequentially."""
     with closing(Executor(commands, scratch, cases, operators)) as executor:
         yield lambda blocks: chain.from_iterable(map(executor.execute, blocks))
-
-
-def _step_tol(record: Record, entry: StoredCase) -> float | None:
-    """Return the tolerance of a step of a fixed-point iteration.
-
-    The tolerance is θ·δ, but at most `MAX_STEP_TOL`, where δ is the relative distance
-    of the QP from the fixed point (`harness.plugin.Case.unsettled`) and θ is
-    `Record.tighten` (Eisenstat and Walker 1996, SIAM J. Sci. Comput. 17). If this value
-    does not exceed the requested tolerance, as in the last step with δ = 0, return
-    None.
-    """
-    delta = float(entry.meta.get("unsettled", 0.0))
-    tol = min(MAX_STEP_TOL, record.tighten * delta)
-    return tol if tol > record.tol else None
 
 
 def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:

@@ -108,19 +108,3 @@ def _student(freedom: float, coverage: float = COVERAGE) -> float:
     freedom : degrees of freedom
     """
     return float(stdtrit(freedom, 0.5 + coverage / 2))
-
-
-def largest_half_width(times: Mapping[str, Mapping[Block, float]]) -> float | None:
-    """Return the largest relative half-width of the ratios to the fastest solver.
-
-    The fastest solver is the one with the smallest median time. Return None if there
-    are fewer than two solvers, and infinity if a ratio has no interval yet.
-
-    times : times by solver and block, in s
-    """
-    if len(times) < 2:
-        return None
-    medians = {s: float(np.median(list(t.values()))) for s, t in times.items()}
-    fastest = min(medians, key=lambda s: medians[s])
-    ratios = [ratio_of(t, times[fastest]) for s, t in times.items() if s != fastest]
-    return max(np.inf if r is None else r.half_width for r in ratios)

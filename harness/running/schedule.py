@@ -1,27 +1,20 @@
-"""Schedule of a suite: remaining measurements, their order, and a stopping rule.
+"""Schedule of a suite: remaining measurements and their order.
 
 The experimental design is a randomised complete block design. In each block, every
 solver is measured once on one case (or sequence) at one tolerance, in random order.
-Every second repeat reverses the order of the previous repeat. If the suite sets a
-precision, further blocks are measured after the prescribed repeats. The ratio of the
-time of each verified solver to the time of the fastest solver has a confidence interval
-(`harness.running.pairs`). No further blocks are measured when all these intervals are
-narrow enough, or when a limit is reached. This stopping rule is fixed in the suite
-before the first measurement. The rule depends only on the journal, so that a resumed
-run stops at the same block as an uninterrupted run.
+Every second repeat reverses the order of the previous repeat.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.work_unit import WorkUnit
-from mortarbench.harness.running.pairs import Block, largest_half_width
 from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.suite.parameter_grid import Growth
 from mortarbench.harness.suite.suite import Group, Suite
@@ -42,8 +35,6 @@ class Schedule:
     progress: Progress
     #: names of the cases that could not be built
     unbuilt: list[str] = field(default_factory=list)
-    #: records by cell; empty unless the suite sets a precision
-    _records: dict[Cell, list[Record]] = field(default_factory=dict)
     _declined: set[tuple[str, Cell]] = field(
         default_factory=set
     )  # solver and cell of each declined case
@@ -60,7 +51,7 @@ class Schedule:
     def cells(self) -> int:
         """Largest possible number of measurements of the suite."""
         s = self.suite
-        return len(s.names) * len(s.tolerances) * self._max_repeats * len(s.solvers)
+        return len(s.names) * len(s.tolerances) * s.repeats * len(s.solvers)
 
     def add(self, record: Record) -> None:
         """Take a measurement in the journal into account."""
@@ -70,8 +61,6 @@ class Schedule:
             self._declined.add((record.solver, _cell(record)))
         elif record.case in self.suite.growing and not record.verdict.is_verified:
             self._ended.add((record.solver, _cell(record)))
-        if self.suite.precision is not None:
-            self._records.setdefault(_cell(record), []).append(record)
 
     def is_settled(self, record: Record) -> bool:
         """Return True if a measurement is in the journal, or is not needed.
@@ -118,15 +107,12 @@ class Schedule:
     def blocks(self) -> Iterator[WorkUnit]:
         """Yield the remaining blocks.
 
-        Each block is determined when it is requested, so that the stopping rule takes
-        all measurements before it into account.
+        Each block is determined when it is requested, so that it takes all measurements
+        before it into account.
         """
         for group in self.suite.groups:
             for tol in self.suite.tolerances:
-                for repeat in range(self._max_repeats):
-                    if repeat >= self.suite.repeats and self._is_enough(group, tol):
-                        self._skip(len(group.cases) * len(self.suite.solvers))
-                        continue
+                for repeat in range(self.suite.repeats):
                     block = self._block(group, tol, repeat)
                     if block is not None:
                         first = block.turns[0][0]
@@ -134,35 +120,6 @@ class Schedule:
                             f"{first.case}, tol {tol:g}, repeat {repeat + 1}"
                         )
                         yield block
-
-    @property
-    def _max_repeats(self) -> int:
-        s = self.suite
-        return s.repeats if s.precision is None else max(s.repeats, s.max_repeats)
-
-    def _is_enough(self, group: Group, tol: float) -> bool:
-        """Return True if the requested precision is reached or the budget is spent.
-
-        The precision counts as reached if fewer than two solvers remain to compare.
-        """
-        assert self.suite.precision is not None
-        records = [
-            r
-            for case in group.cases
-            for r in self._records.get((group.mode, case.name, tol), ())
-        ]
-        if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
-            return True
-        # A single failure excludes a solver, since a time without a solution is not
-        # comparable.
-        failed = {r.solver for r in records if not r.verdict.is_verified}
-        times: dict[str, dict[Block, float]] = {}
-        for solver in {r.solver for r in records} - failed:
-            times[solver] = _by_block(
-                r for r in records if r.solver == solver and r.total_seconds
-            )
-        width = largest_half_width(times)
-        return width is None or width <= self.suite.precision
 
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
         """Return a block with its remaining turns in random order; None if none remain.
@@ -214,24 +171,6 @@ class Schedule:
     def _skip(self, cells: int) -> None:
         for _ in range(cells):
             self.progress.advance(None)
-
-
-def _by_block(records: Iterable[Record]) -> dict[Block, float]:
-    """Return the total time of the steps of each repeat, in s, by block.
-
-    If a sequence was interrupted and resumed, its records come from several sessions.
-    The names of these sessions together identify the block, so that the sequence is
-    paired only with sequences from the same sessions.
-    """
-    repeats: dict[int, list[Record]] = {}
-    for r in records:
-        repeats.setdefault(r.repeat, []).append(r)
-    return {
-        (" ".join(sorted({r.session for r in steps})), repeat): sum(
-            r.total_seconds or 0.0 for r in steps
-        )
-        for repeat, steps in repeats.items()
-    }
 
 
 def _fields(case: CaseId) -> dict[str, Any]:

@@ -1,10 +1,10 @@
 """Permitted changes of a suite that has a result folder, and unions of suites.
 
 Such a suite may only be extended: solvers, cases, tolerances and a `null_arm` may be
-added, the number of repeats and the budget may be raised, and a precision may be set or
-tightened. The limits, the accuracy and the solver of each label must not change, since
-the stored measurements depend on these settings. Suites in which these settings agree
-can be united. The name of a suite that has a result folder must not change either.
+added, and the number of repeats may be raised. The limits, the accuracy and the solver
+of each label must not change, since the stored measurements depend on these settings.
+Suites in which these settings agree can be united. The name of a suite that has a
+result folder must not change either.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from mortarbench.harness.suite.suite import DEFAULTS, suite_text
 
 #: settings that must not change, since stored verdicts and times depend on them
 FIXED_KEYS = ("time_limit", "memory_limit", "accuracy")
-GROWING_KEYS = ("repeats", "max_repeats", "budget")  #: settings that may only grow
-
 _AND = "-and-"  #: separator of the names of united suites
 
 Table = Mapping[str, Any]  #: content of a suite's TOML
@@ -38,13 +36,8 @@ def _settings(old: Table, new: Table) -> Iterator[str]:
     for key in ("name", *FIXED_KEYS):
         if old.get(key) != new.get(key):
             yield _change(key, old.get(key), new.get(key))
-    for key in GROWING_KEYS:
-        if new[key] < old[key]:
-            yield f"{_change(key, old[key], new[key])}; it may only grow"
-    finer = "it may only be reduced"
-    # None counts as the loosest precision, 1
-    if old["precision"] is not None and (new["precision"] or 1) > old["precision"]:
-        yield f"{_change('precision', old['precision'], new['precision'])}; {finer}"
+    if new["repeats"] < old["repeats"]:
+        yield f"{_change('repeats', old['repeats'], new['repeats'])}; it may only grow"
 
 
 def _members(old: Table, new: Table) -> Iterator[str]:
@@ -120,9 +113,9 @@ def _add(union: dict[str, Any], table: Table) -> None:
         *str(table.get("name")).split(_AND),
     ]
     union["name"] = _AND.join(dict.fromkeys(filter(None, names)))
-    for key in GROWING_KEYS:
-        if key in table:
-            union[key] = max(table[key], union.get(key, DEFAULTS[key]))
+    if "repeats" in table:
+        repeats = union.get("repeats", DEFAULTS["repeats"])
+        union["repeats"] = max(table["repeats"], repeats)
     for key in ("tolerances", "solvers", "problems"):
         if key not in union.keys() | table.keys():
             continue

@@ -17,7 +17,6 @@ from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, read_toml, toml
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Family, Solver
-from mortarbench.harness.record import TIGHTENING
 from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.suite.parameter_grid import Growth, expand_problems
 
@@ -26,12 +25,8 @@ DEFAULTS: Mapping[str, Any] = {
     "repeats": 3,
     "time_limit": 60,
     "memory_limit": 4096,
-    "precision": None,
-    "max_repeats": 30,
-    "budget": 600,
     "accuracy": None,
     "null_arm": None,
-    "tighten": [0],
     "ranks": [1],
     "max_cases": 100_000,
 }
@@ -56,9 +51,6 @@ _NUMBERS: Mapping[str, Callable[[str, Any], float | None]] = {
     "repeats": checked.at_least_one,
     "time_limit": checked.positive,
     "memory_limit": checked.positive,
-    "precision": _between,
-    "max_repeats": checked.at_least_one,
-    "budget": checked.positive,
     "accuracy": _between,
 }
 
@@ -90,17 +82,6 @@ class Suite:
     sequences: tuple[tuple[CaseId, ...], ...] = ()
     #: positions of cases in series of growing sizes, by name of the case
     growing: Mapping[str, Growth] = field(default_factory=dict)
-    #: values of θ, see `harness.record.Record.tighten`. Each sequence is solved once
-    #: for each value; 0 means constant tolerances
-    tighten: tuple[float, ...] = (0.0,)
-    #: requested relative half-width of confidence intervals; no further repeats are
-    #: measured when the half-width of every ratio to the fastest solver is at most this
-    #: value. If None, the number of repeats is `repeats`
-    precision: float | None = None
-    max_repeats: int = 30  #: largest number of repeats, if a precision is set
-    #: total time of the solvers per case and tolerance, in s, after which no repeats
-    #: beyond `repeats` are measured, if a precision is set
-    budget: float = 600.0
     #: tolerance of the verdicts; None for the tolerance that is passed to the solver
     accuracy: float | None = None
     every: frozenset[str] = frozenset()  #: names of all cases, regardless of ``--case``
@@ -110,16 +91,12 @@ class Suite:
         """Groups of cases that form a block: single cases, followed by sequences."""
         return (
             *(Group((case,), "cold") for case in self.cases),
-            *(
-                Group(steps, f"{TIGHTENING}{theta:g}" if theta else "sequence")
-                for steps in self.sequences
-                for theta in self.tighten
-            ),
+            *(Group(steps, "sequence") for steps in self.sequences),
         )
 
     @property
     def names(self) -> tuple[CaseId, ...]:
-        """All cases: single cases, then the steps of each sequence, once for each θ."""
+        """All cases: single cases, then the steps of each sequence."""
         return tuple(case for group in self.groups for case in group.cases)
 
 
@@ -186,7 +163,6 @@ def parse_suite(
             every=every,
             sequences=sequences,
             growing=problems.growing,
-            tighten=_tightening(table, sequences),
             **numbers,
         )
 
@@ -214,7 +190,7 @@ def read_stored(path: Path) -> dict[str, Any]:
     """
     table = read_toml(path, "the suite of a result folder")
     try:
-        for key in ("tolerances", "tighten", "ranks"):
+        for key in ("tolerances", "ranks"):
             numbers = checked.any_list(key, table.get(key, []))
             if not all(map(_is_finite, numbers)):
                 raise InputError(f"{key} = {shown(numbers)}; expected numbers")
@@ -414,32 +390,6 @@ def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec
         raise unknown("null_arm", label, by_label)
     copy = replace(by_label[label], label=f"{label}{NULL_SUFFIX}", role="null")
     return (*specs, copy)
-
-
-def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...]:
-    """Check the values of θ (see `Suite.tighten`), and return them.
-
-    Nonzero values are refused if there are no sequences, or if an accuracy is set.
-    """
-    thetas = checked.filled_list("tighten", table["tighten"])
-    if not all(checked.is_number(t) and 0 <= t < 1 for t in thetas) or len(
-        set(thetas)
-    ) < len(thetas):
-        raise InputError(
-            f"tighten = {shown(thetas)}; expected distinct numbers θ with 0 ≤ θ < 1, "
-            "where 0 means a constant tolerance"
-        )
-    if any(thetas) and not sequences:
-        raise InputError(
-            f"tighten = {shown(thetas)} needs a sequence; expected sequence = KEY in "
-            "one of the problems"
-        )
-    if any(thetas) and table["accuracy"] is not None:
-        raise InputError(
-            f"tighten = {shown(thetas)}: every answer is judged at accuracy = "
-            f"{shown(table['accuracy'])}; expected only one of the two"
-        )
-    return tuple(map(float, thetas))
 
 
 def _tolerances(value: object) -> tuple[float, ...]:

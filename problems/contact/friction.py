@@ -117,8 +117,6 @@ def coulomb_fixed_point(
 ) -> list[Friction]:
     """Solve Coulomb's law by fixed-point iteration; return a `Friction` per iterate.
 
-    In all iterates except the last, `Friction.unsettled` is the residual.
-
     Parameters
     ----------
     first : friction with the initial bound
@@ -146,7 +144,7 @@ def coulomb_fixed_point(
         residuals.append(friction.residual(forces))
         if residuals[-1] <= FIXED_POINT_TOLERANCE:
             return [*iterates, friction]
-        iterates.append(replace(friction, unsettled=residuals[-1]))
+        iterates.append(friction)
         if len(iterates) - int(np.argmin(residuals)) > MAX_STAGNATION:
             break
         friction = replace(friction, bound=friction.demanded(forces))  # g ← mu·λ_n

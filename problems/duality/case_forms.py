@@ -223,7 +223,6 @@ def contact_case(
             # subdomains are certified for supports with u = 0
             subdomains=None if has_lift else by_subdomains,
         ),
-        unsettled=friction.unsettled,
     )
 
 

@@ -118,7 +118,6 @@ class Fclib(FromFile):
             quantities=evaluate,
             scale=force * speed,
             remarks=tuple(remarks),
-            unsettled=0.0 if p["iterate"] == 0 else steps[-1].error,
         )
 
 

@@ -150,7 +150,6 @@ def _sentence(solver: str, tol: float, outcomes: Sequence[Outcome]) -> str:
             if (those := by_verdict.get(verdict))
         },
         worst=max((o.worst or 0.0 for o in tried), default=0.0),
-        loosest=max((o.first.step_tol or 0.0 for o in tried), default=0.0),
         bounds=bounds,
         unclaimed=sum(unclaimed),
         declined=declined,

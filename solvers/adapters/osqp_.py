@@ -22,7 +22,7 @@ from mortarbench.solvers.common.conversion import (
     to_two_sided,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, chain, tightening
+from mortarbench.solvers.common.sequence import Session, chain
 
 PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
@@ -84,9 +84,6 @@ class OSQP:
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         return chain(self._begin, tol)
 
-    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
-        return tightening(self._begin)
-
     def _begin(self, qp: QP, tol: float) -> Session:
         import osqp
 
@@ -136,7 +133,4 @@ class OSQP:
         def start(s: Solution) -> None:
             solver.warm_start(x=s.x, y=to_two_sided(qp, s) * scale)
 
-        def tighten(tol: float) -> None:
-            solver.update_settings(eps_rel=tol)
-
-        return Session(solve, update, start, tighten)
+        return Session(solve, update, start)

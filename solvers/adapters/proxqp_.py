@@ -34,7 +34,7 @@ from mortarbench.solvers.common.conversion import (
     resolve_backend,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, chain, tightening
+from mortarbench.solvers.common.sequence import Session, chain
 
 PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
@@ -103,9 +103,6 @@ class ProxQP:
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         return chain(self._begin, tol)
 
-    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
-        return tightening(self._begin)
-
     def _begin(self, qp: QP, tol: float) -> Session:
         from proxsuite import proxqp
 
@@ -114,16 +111,12 @@ class ProxQP:
         solver = form.set_up_solver(proxqp)
         settings = solver.settings
         settings.eps_abs = settings.eps_duality_gap_abs = NEGLIGIBLE
+        settings.eps_rel = settings.eps_duality_gap_rel = tol
         settings.check_duality_gap = settings.compute_timings = True
         settings.eps_primal_inf = settings.eps_dual_inf = CERTIFICATE
         settings.initial_guess = proxqp.NO_INITIAL_GUESS
         settings.max_iter = self.max_iter
         starts: list[Solution] = []
-
-        def tighten(tol: float) -> None:
-            settings.eps_rel = settings.eps_duality_gap_rel = tol
-
-        tighten(tol)
 
         def solve() -> Solution:
             if starts:
@@ -159,9 +152,7 @@ class ProxQP:
 
         # `solve` of the dense backend takes x, y and z, but no multipliers of bounds
         takes_no_start = isinstance(form, _Dense) and form.has_box
-        return Session(
-            solve, update, None if takes_no_start else starts.append, tighten
-        )
+        return Session(solve, update, None if takes_no_start else starts.append)
 
 
 class _Dense:

@@ -27,7 +27,7 @@ from mortarbench.solvers.common.conversion import (
     objective_factor,
     to_cone,
 )
-from mortarbench.solvers.common.sequence import Session, chain, tightening
+from mortarbench.solvers.common.sequence import Session, chain
 
 PRIMAL = "infeasible"  #: status with a certificate of infeasibility
 CLAIMS = {
@@ -92,9 +92,6 @@ class QTQP:
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         return chain(self._begin, tol)
-
-    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
-        return tightening(self._begin)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import qtqp

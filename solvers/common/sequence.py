@@ -21,51 +21,36 @@ class Session(NamedTuple):
     #: sets the starting point of the next solve; None if the library does not accept a
     #: starting point
     start: Callable[[Solution], None] | None = None
-    #: changes the tolerance of all later solves; None if this requires a new session
-    tighten: Callable[[float], None] | None = None
 
 
 def chain(
     begin: Callable[[QP, float], Session], tol: float
 ) -> Callable[[QP], Callable[[], Solution]]:
-    """Return the `prepare` function for a sequence of QPs with the tolerance `tol`."""
-    prepare = tightening(begin)
-    return lambda qp: prepare(qp, tol)
-
-
-def tightening(
-    begin: Callable[[QP, float], Session],
-) -> Callable[[QP, float], Callable[[], Solution]]:
-    """Return the `prepare` function for a sequence with a tolerance for each QP.
+    """Return the `prepare` function for a sequence of QPs with the tolerance `tol`.
 
     If the session has `update` and only vectors differ from the previous QP, the
     session is updated, and a library that supports warm starts continues from its last
     point. Otherwise `begin` creates a new session. The new session starts from the last
     point if the library accepts a starting point, and if the sizes, the bounded
-    variables and the conic rows match. A new tolerance also requires a new session,
-    unless the session has `tighten`.
+    variables and the conic rows match.
     """
     session: Session | None = None
     session_qp: QP
-    session_tol: float
     last: tuple[QP, Solution] | None = None
 
-    def prepare(qp: QP, tol: float) -> Callable[[], Solution]:
-        nonlocal session, session_qp, session_tol
+    def prepare(qp: QP) -> Callable[[], Solution]:
+        nonlocal session, session_qp
         if (
             session is not None
             and session.update is not None
-            and (tol == session_tol or session.tighten is not None)
             and only_vectors_differ(session_qp, qp)
         ):
             session.update(qp)
-            if session.tighten is not None:
-                session.tighten(tol)
         else:
             session = begin(qp, tol)
             if last is not None and session.start is not None and _fits(*last, qp):
                 session.start(last[1])
-        session_qp, session_tol = qp, tol
+        session_qp = qp
         solve_session = session.solve
 
         def solve() -> Solution:

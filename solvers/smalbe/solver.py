@@ -79,10 +79,6 @@ class SMALBE(Options):
         return lambda: solve()[0]
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        prepare = self.tightening()
-        return lambda qp: prepare(qp, tol)
-
-    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         """Start a sequence in which each solve reuses results of the previous one.
 
         The reused results are the point, the multipliers, the Ritz pairs and the factor
@@ -90,7 +86,7 @@ class SMALBE(Options):
         """
         carry: Carry | None = None
 
-        def prepare(qp: QP, tol: float) -> Callable[[], Solution]:
+        def prepare(qp: QP) -> Callable[[], Solution]:
             solve = prepared(qp, tol, self, carry, in_sequence=True)
 
             def run() -> Solution:

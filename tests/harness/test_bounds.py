@@ -235,9 +235,9 @@ def test_invalid_json_is_refused_with_the_name_of_the_file(tmp_path, text):
         ("repeats = 1_000_000_000_000", "expected an integer of at most 1000000"),
         ("tolerances = [1e-6, 1e-6]", "expected distinct numbers"),
         ("tolerances = [nan]", "expected distinct numbers between 0 and 1"),
-        ("budget = inf", "budget = inf; expected a positive number"),
+        ("time_limit = inf", "time_limit = inf; expected a positive number"),
         ('null_arm = "a\\u0000b"', "expected a string without control characters"),
-        (f"precision = {'9' * 4000}", "expected a number between 0 and 1"),
+        (f"accuracy = {'9' * 4000}", "expected a number between 0 and 1"),
         ("time_limit = 1e400", "time_limit = inf; expected a positive number"),
     ],
 )

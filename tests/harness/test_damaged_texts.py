@@ -62,7 +62,6 @@ repeats = 3
 time_limit = 60
 memory_limit = 4096.0
 null_arm = "osqp"
-precision = 0.1
 solvers = ["osqp", { name = "clarabel", label = "few", options = { max_iter = 200 } }]
 
 [[problems]]

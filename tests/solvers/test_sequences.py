@@ -212,17 +212,6 @@ def test_qtqp_stops_at_a_start_that_is_the_solution(load_steps, form):
     assert kkt_residuals(qp, second).worst <= 1e-5
 
 
-def test_qtqp_starts_each_tolerance_from_the_last_point(load_steps):
-    qp = load_steps["primal"][9]
-    prepare = SOLVERS["qtqp"].tightening()
-    loose, tight = prepare(qp, 1e-3)(), prepare(qp, 1e-8)()
-    cold = SOLVERS["qtqp"].prepare(qp, 1e-8)()
-
-    assert kkt_residuals(qp, tight).worst <= 1e-7
-    assert 0 < tight.iterations < cold.iterations
-    assert loose.iterations < cold.iterations
-
-
 def test_qtqp_starts_cold_after_a_qp_of_another_shape_or_without_a_solution(load_steps):
     qp, other = load_steps["dual"][9], load_steps["dual-bounds"][9]
     impossible = replace(qp, A=np.vstack([qp.A, qp.A[:1]]), b=np.append(qp.b, 1e3))

@@ -74,7 +74,6 @@ class Tiny:
         )  # fmt: skip
         return Case(
             qp=qp, recover=lambda s: s.x, quantities=quantities, fields=fields,
-            unsettled=1e-3 * params["h"],
         )  # fmt: skip
 
 
@@ -301,19 +300,6 @@ class Chains(Honest):
             return lambda: replace(at_the_row(qp), iterations=len(seen))
 
         return prepare
-
-
-class Tightens(Chains):
-    """Solver that also reports the tolerance of each QP of a sequence."""
-
-    def tightening(self):
-        prepare = self.chain(0.0)
-
-        def at(qp, tol):
-            solve = prepare(qp)
-            return lambda: replace(solve(), reported={"tol": tol})
-
-        return at
 
 
 class BreaksItsChain(Honest):

@@ -1,4 +1,4 @@
-"""Schedule of blocks: stopping rule, order and resumption."""
+"""Schedule of blocks: order and resumption."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from mortarbench.harness import Verdict
 from mortarbench.harness.names import assemble
 from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
-from mortarbench.harness.running.pairs import largest_half_width, paired_ratio
+from mortarbench.harness.running.pairs import paired_ratio
 from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.parameter_grid import Growth
 from mortarbench.harness.suite.suite import Suite
@@ -54,22 +54,6 @@ def schedule_of(**changes):
     )  # fmt: skip
 
 
-def records_after(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
-    """Return records of a suite in which a, b and c take 1, 2 and 4 s, with noise."""
-    rng = np.random.default_rng(seed)
-    schedule = schedule_of(**changes)
-    made = []
-    for block in schedule.blocks():
-        for (record,) in block.turns:
-            seconds = {"a": 1.0, "b": 2.0, "c": 4.0}[record.solver]
-            seconds *= float(np.exp(noise * rng.standard_normal()))
-            record = record.replace(verdict=verdict, total_seconds=seconds)
-            schedule.add(record)
-            made.append(record)
-    assert len(made) + schedule.progress.skipped == schedule.cells
-    return made
-
-
 def test_the_order_of_a_block_is_reversed_in_the_next():
     """Mean positions of solvers are equal; pairs of blocks have random orders."""
     solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
@@ -79,26 +63,6 @@ def test_the_order_of_a_block_is_reversed_in_the_next():
     assert [order[::-1] for order in orders[::2]] == orders[1::2]
     assert {"".join(sorted(order)) for order in orders} == {"abcdef"}
     assert len(set(orders)) == 6
-
-
-def test_sequences_are_compared_by_their_total_time():
-    """The times of the steps are noisy, but their errors cancel in the sum."""
-    rng = np.random.default_rng(161803)
-    steps = cases_of(1, 2)
-    schedule = schedule_of(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
-    blocks = 0
-    for block in schedule.blocks():
-        blocks += 1
-        for turn in block.turns:
-            whole = {"a": 1.0, "b": 2.0}[turn[0].solver]
-            part = whole * rng.uniform(0.2, 0.8)
-            for record, seconds in zip(turn, (part, whole - part), strict=True):
-                timed = record.replace(verdict=Verdict.VERIFIED, total_seconds=seconds)
-                schedule.add(timed)
-
-        assert block.is_sequence
-
-    assert blocks == 3
 
 
 def records_of(blocks):
@@ -159,54 +123,6 @@ def test_each_block_is_announced_before_it_starts():
     ]
 
 
-def test_without_a_precision_the_repeats_of_the_suite_are_measured():
-    assert len(records_after(0.5)) == 2 * 3
-
-
-def test_precise_times_need_only_the_repeats_of_the_suite():
-    assert len(records_after(1e-4, precision=0.05)) == 2 * 3
-
-
-@pytest.mark.parametrize("solvers", ["ab", "abc"])
-def test_blocks_continue_until_the_ratio_has_the_requested_precision(solvers):
-    specs = tuple(SolverSpec(name=s, label=s) for s in solvers)
-    made = records_after(0.1, solvers=specs, precision=0.05, max_repeats=200)
-    times = {
-        s: {r.repeat: r.total_seconds for r in made if r.solver == s} for s in solvers
-    }
-    before = {s: {k: v for k, v in t.items() if k < max(t)} for s, t in times.items()}
-
-    assert len(solvers) * 3 < len(made) < len(solvers) * 200
-    assert largest_half_width(times) <= 0.05 < largest_half_width(before)
-
-
-def test_blocks_end_at_the_largest_number_of_repeats_and_at_the_budget():
-    assert len(records_after(2.0, precision=0.01, max_repeats=7)) == 2 * 7
-    spent = records_after(0.1, precision=0.001, max_repeats=99, budget=30.0)
-
-    assert 30 <= sum(r.total_seconds for r in spent) < 36
-
-
-def test_records_without_a_time_spend_no_budget():
-    """A failing solver has no time; other solvers need many blocks."""
-    specs = tuple(SolverSpec(name=s, label=s) for s in "abc")
-    schedule = schedule_of(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
-    rng = np.random.default_rng(271828)
-    spent = 0.0
-    for block in schedule.blocks():
-        for (record,) in block.turns:
-            if record.solver == "c":
-                schedule.add(record.replace(verdict=Verdict.FAILED))
-                continue
-            seconds = float(rng.uniform(0.9, 1.1))
-            spent += seconds
-            schedule.add(
-                record.replace(verdict=Verdict.VERIFIED, total_seconds=seconds)
-            )
-
-    assert 30 <= spent < 33
-
-
 def test_each_part_of_a_block_has_its_own_number():
     schedule = schedule_of()
     first = next(schedule.blocks()).number
@@ -215,10 +131,6 @@ def test_each_part_of_a_block_has_its_own_number():
     assert len({first, *numbers}) == 4
     assert schedule.block_of_part(0, 2) == numbers[1]
     assert next(schedule.blocks()).number not in numbers
-
-
-def test_failing_solvers_do_not_prolong_the_measurement():
-    assert len(records_after(2.0, precision=0.01, verdict=Verdict.WRONG)) == 2 * 3
 
 
 def test_the_paired_interval_has_its_nominal_coverage():

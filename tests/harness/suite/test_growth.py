@@ -19,7 +19,7 @@ SUITE = {
         {"solvers": [*SUITE["solvers"], "c"]},
         {"solvers": SUITE["solvers"][::-1]},
         {"tolerances": [1e-4, 1e-6, 1e-8]},
-        {"repeats": 5, "precision": 0.1, "max_repeats": 50, "budget": 700},
+        {"repeats": 5},
         {"null_arm": "a"},
     ],
 )
@@ -47,17 +47,9 @@ def test_settings_of_past_measurements_may_not_change(change, said):
     assert incompatibility(SUITE, SUITE | change) == said
 
 
-def test_a_stopping_rule_may_only_become_stricter():
-    ruled = SUITE | {"precision": 0.1, "null_arm": "a"}
-
-    assert incompatibility(ruled, ruled | {"precision": 0.05}) == ""
-    said = "precision was 0.1, now 0.2; it may only be reduced"
-    assert incompatibility(ruled, ruled | {"precision": 0.2}) == said
-    assert incompatibility(ruled, SUITE).startswith("precision was 0.1, now not set")
-    assert (
-        incompatibility(ruled, ruled | {"null_arm": None})
-        == "null_arm was 'a', now not set"
-    )
+def test_a_null_arm_may_not_be_removed():
+    with_copy = SUITE | {"null_arm": "a"}
+    assert incompatibility(with_copy, SUITE) == "null_arm was 'a', now not set"
 
 
 def test_a_conflict_of_labels_names_the_two_folders_in_conflict():
