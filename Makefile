@@ -56,8 +56,9 @@ bench: setup  ## time our own kernels (pytest-benchmark)
 docs: setup  ## write docs/solvers*.md and mortarbench/catalogue.json from the adapters
 	@$(BIN)/python tools/catalogue.py
 
-weaknesses: setup  ## measure and rewrite docs/weaknesses.md (minutes)
-	@$(BIN)/mortarbench test-solver '*' $(BACKENDS) --markdown > docs/weaknesses.md
+weaknesses: setup  ## measure effects of equivalent formulations, for the site (minutes)
+	@mkdir -p out
+	@$(BIN)/mortarbench test-solver '*' $(BACKENDS) --markdown > out/weaknesses.md
 
 size: setup  ## measure time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py

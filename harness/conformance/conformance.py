@@ -16,22 +16,20 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
-from statistics import median
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness.conformance.equivalence import (
+    CHANGES_OF,
     WeaknessError,
-    changes_of,
     same_answer,
 )
 from mortarbench.harness.conformance.manufactured import (
-    FORMS,
     SET_SHAPES,
     SHAPES,
-    degenerate_cone,
     infeasible,
     manufactured,
     manufactured_over_sets,
@@ -43,32 +41,25 @@ from mortarbench.harness.conformance.metamorphic import shift_unknowns
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
 from mortarbench.harness.verify.infeasibility import certificate_of
 from mortarbench.harness.verify.kkt import diagnosis, kkt_residuals
 from mortarbench.harness.verify.measure import (
-    REMEMBERED_SPEEDUP,
     DeclinedError,
     Prepare,
     SolverError,
+    measure,
     solve_once,
 )
 
 #: beginning of the names of checks that compare the answer with a planted solution
 SOLUTION_PREFIX = "finds the planted solution"
+#: beginning of the names of checks that compare equivalent formulations
+INVARIANCE_PREFIX = "keeps its answer"
 #: shapes for checks of a property that does not depend on the constraints: QPs with
 #: lower bounds alone, which every solver should accept, and QPs with all constraints
 ACCEPTED_BY_MOST = ("bounds", "everything")
-#: beginning of the names of checks of QPs over discs and cones
-SETS_PREFIX = "solves over"
-#: name of the check that solves `degenerate_cone`
-DEGENERATE = f"{SETS_PREFIX} the degenerate cone"
-#: tolerances of the check `DEGENERATE`
-DEGENERATE_TOLERANCES = (1e-6, 1e-8)
-#: beginning of the names of checks that solve one QP twice, with others between
-MEMORY_PREFIX = "remembers no answer"
-#: beginning of the names of checks that compare equivalent formulations
-INVARIANCE_PREFIX = "keeps its answer"
 #: advice for solvers that need the entries of P
 _DECLINE_OPERATORS = (
     "if the solver needs the entries of P, add this line to declines(self, qp): "
@@ -81,14 +72,9 @@ GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest permitted difference in x between repeats. The order of summation, and hence
 #: rounding, may depend on the alignment of arrays in memory.
 REPEAT_ROUNDING = 1e-12
-#: Number of variables of the QPs of the check of remembered answers. Solvers take
-#: milliseconds, so that a cache saves more than `MIN_GAIN_SECONDS`.
+#: Number of variables of the QP of the check of remembered answers. Solvers take
+#: milliseconds, so that a cache is noticed in the times.
 TIMED_VARIABLES = 300
-MIN_GAIN_SECONDS = 1e-3  #: smallest gain in time that counts as remembering, s
-#: Number of experiments before a solver is accused. Other programs may delay a few
-#: solves, so that the median of the second solves of A is compared with the fastest
-#: solve of B and B'.
-EXPERIMENTS = 5
 
 
 class Grade(StrEnum):
@@ -160,8 +146,8 @@ def _judge(qp: QP, s: Solution, allowed: float) -> None:
         )
 
 
-def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None:
-    qp, expected = manufactured(shape, dense=dense)
+def _finds_the_planted_solution(shape: str, solver: Solver) -> None:
+    qp, expected = manufactured(shape)
     # judged at 1e-8: a bound may be far smaller than the norms in a solver's own test
     s = _solved(solver, qp, 1e-9, 10 * VERIFIED_FACTOR)
     objective = qp.objective(expected.x)
@@ -186,22 +172,9 @@ def _solves_over_sets(shape: str, solver: Solver) -> Result:
     return Result(Grade.PASS, f"error in x {np.abs(s.x - expected.x).max():.0e}")
 
 
-def _solves_the_degenerate_cone(solver: Solver) -> Result:
-    """Require verified answers, and report their errors in x, which are about √tol."""
-    qp, x = degenerate_cone()
-    errors = [
-        float(np.abs(_solved(solver, qp, tol, VERIFIED_FACTOR).x - x).max())
-        for tol in DEGENERATE_TOLERANCES
-    ]
-    texts = (
-        f"{error:.0e} at {tol:g}"
-        for error, tol in zip(errors, DEGENERATE_TOLERANCES, strict=True)
-    )
-    return Result(Grade.PASS, f"error in x {', '.join(texts)}")
-
-
-def _reaches_the_tolerance(shape: str, tol: float, solver: Solver) -> None:
-    _solved(solver, manufactured(shape, seed=161803)[0], tol, VERIFIED_FACTOR)
+def _reaches_the_tolerance(shape: str, solver: Solver) -> None:
+    for tol in (1e-3, 1e-6):
+        _solved(solver, manufactured(shape, seed=161803)[0], tol, VERIFIED_FACTOR)
 
 
 def _multipliers_have_our_signs(solver: Solver) -> None:
@@ -232,25 +205,26 @@ def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
 
 def _repeats_are_cold_and_alike(solver: Solver) -> None:
     qp, _ = manufactured("bounds", n=60)
-    first, *others = (_solve(solver, qp, 1e-6) for _ in range(3))
-    if first.status is not Status.SOLVED:
-        raise ContractError(f"ended as {first.status}: {first.message}")
+    first, *others = (_solved(solver, qp, 1e-6, VERIFIED_FACTOR) for _ in range(3))
     for s in others:
         if s.iterations != first.iterations:
             raise ContractError(f"iterations: {first.iterations}, then {s.iterations}")
         _near("x of a repeat", s.x, first.x, REPEAT_ROUNDING)
 
 
-def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
-    qp, _ = manufactured("everything", dense=dense)
-    before = [buffer.copy() for buffer in _buffers(qp)]
-    s = _solve(solver, qp, 1e-6)
-    # also compare values, since a solver can make read-only arrays writable
-    for buffer, copy in zip(_buffers(qp), before, strict=True):
-        if buffer.flags.writeable or not np.array_equal(buffer, copy):
-            raise ContractError("modified the QP")
-    if s.status is not Status.SOLVED:
-        raise ContractError(f"ended as {s.status}: {s.message}")
+def _the_problem_is_left_alone(shape: str, solver: Solver) -> None:
+    """Require correct answers to a QP with sparse and dense matrices, left unchanged.
+
+    Values are also compared, since a solver can make read-only arrays writable.
+    """
+    for dense in (False, True):
+        qp, _ = manufactured(shape, dense=dense)
+        before = [buffer.copy() for buffer in _buffers(qp)]
+        s = _solve(solver, qp, 1e-6)
+        for buffer, copy in zip(_buffers(qp), before, strict=True):
+            if buffer.flags.writeable or not np.array_equal(buffer, copy):
+                raise ContractError("modified the QP")
+        _judge(qp, s, VERIFIED_FACTOR * 1e-6)
 
 
 def _a_misspelt_option_is_refused(solver: Solver) -> None:
@@ -304,8 +278,7 @@ def _runs_in_one_thread(solver: Solver) -> None:
         used, passed = time.process_time() - used, time.perf_counter() - passed
     finally:
         os.sched_setaffinity(0, allowed)
-    if s.status is not Status.SOLVED:
-        raise ContractError(f"ended as {s.status}: {s.message}")
+    _judge(qp, s, VERIFIED_FACTOR * 1e-6)
     if used > 1.2 * passed + 0.02:
         raise ContractError(
             f"used {used:.2f} s of CPU time in {passed:.2f} s; expected one thread"
@@ -332,47 +305,28 @@ def _chained(solver: Solver) -> Prepare:
     return prepare
 
 
-def _remembers_no_answer(solver: Solver, *, chained: bool) -> None:
-    """Solve the QPs A, B, A and B', which have the same shape and different numbers.
-
-    A is the same object in both solves. Its first solve may be slow, for instance
-    because code is compiled, and is not compared. A factor of a sparsity pattern may be
-    reused, since it also accelerates the solves of B and B'.
-
-    chained : True to solve each QP as the first one of a new sequence
-    """
-    repeated, others = list[float](), list[float]()
-    for seed in range(0, 3 * EXPERIMENTS, 3):
-        a, b, other = (
-            manufactured("bounds", seed=seed + k, n=TIMED_VARIABLES)[0]
-            for k in range(3)
-        )
-        seconds, earlier = list[float](), list[tuple[QP, Solution]]()
-        for qp in (a, b, a, other):
-            prepare = _chained(solver) if chained else None
-            s, total = solve_once(solver, qp, 1e-6, prepare)
-            if any(p is not qp and np.array_equal(t.x, s.x) for p, t in earlier):
-                raise ContractError(
-                    "returned the answer of another QP of the same shape"
-                )
-            _judge(qp, s, VERIFIED_FACTOR * 1e-6)
-            seconds.append(total)
-            earlier.append((qp, s))
-        repeated.append(seconds[2])
-        others += seconds[1::2]
-        if not _gains(min(repeated), min(others)):
-            return
-    if _gains(median(repeated), min(others)):
+def _remembers_no_answer(solver: Solver) -> None:
+    qp, _ = manufactured("bounds", n=TIMED_VARIABLES)
+    timed = measure(solver, qp, 1e-6)
+    if timed.solution.status is Status.DECLINED:
+        raise DeclinedError(timed.solution.message)
+    _judge(qp, timed.solution, VERIFIED_FACTOR * 1e-6)
+    if timed.cost.remembered:
         raise ContractError(
-            f"the second solve of a QP took {median(repeated):.2g} s, solves of other "
-            f"QPs of the same shape took {min(others):.2g} s or more; expected no "
-            "results of earlier solves"
+            "solves of a QP are much faster than solves of a slightly different one, "
+            "or have the same answer; expected no results of earlier solves"
         )
 
 
-def _gains(repeated: float, other: float) -> bool:
-    """Return True if a repeated solve is much faster than another one, times in s."""
-    return other > max(REMEMBERED_SPEEDUP * repeated, repeated + MIN_GAIN_SECONDS)
+def _remembers_no_sequence(solver: Solver) -> None:
+    """Solve QPs as first QPs of new sequences, and require that none is remembered."""
+    _chained(solver)
+    first: Any = SimpleNamespace(
+        accepts=getattr(solver, "accepts", (Box,)),
+        declines=solver.declines,
+        prepare=lambda qp, tol: _chained(solver)(qp),
+    )
+    _remembers_no_answer(first)
 
 
 def _sequence() -> list[QP]:
@@ -413,41 +367,41 @@ def _buffers(qp: QP) -> Iterator[Vector]:
         yield from one.arrays().values()
 
 
-def _all_checks() -> Iterator[tuple[str, Check]]:
-    for shape in SHAPES:
-        name = f"{SOLUTION_PREFIX}: {shape}"
-        yield name, partial(_finds_the_planted_solution, shape, False)
-    for shape in ACCEPTED_BY_MOST:
-        name = f"{SOLUTION_PREFIX}: {shape}, dense"
-        yield name, partial(_finds_the_planted_solution, shape, True)
-        for tol in (1e-3, 1e-6):
-            name = f"reaches the tolerance {tol:g}: {shape}"
-            yield name, partial(_reaches_the_tolerance, shape, tol)
-    for shape in SET_SHAPES:
-        yield f"{SETS_PREFIX} {shape}", partial(_solves_over_sets, shape)
-    yield DEGENERATE, _solves_the_degenerate_cone
-    yield "finds where a membrane of 400 nodes touches", _many_bounds_and_no_rows
-    yield "gives multipliers our signs", _multipliers_have_our_signs
-    yield "puts none on absent bounds", _absent_bounds_have_no_multipliers
-    yield "starts every repeat cold, same answer", _repeats_are_cold_and_alike
-    for chained, ending in ((False, ""), (True, ", sequences")):
-        name = f"{MEMORY_PREFIX}: bounds{ending}"
-        yield name, partial(_remembers_no_answer, chained=chained)
-    for dense in (False, True):
-        name = f"leaves the problem alone: {'dense' if dense else 'sparse'}"
-        yield name, partial(_the_problem_is_left_alone, dense)
-    yield "refuses a misspelt option", _a_misspelt_option_is_refused
-    yield "claims no success: infeasible", partial(_claims_no_success, infeasible)
-    yield "claims no success: unbounded", partial(_claims_no_success, unbounded)
-    yield "takes or declines an operator", _an_operator_is_taken_or_declined
-    yield "computes in one thread", _runs_in_one_thread
-    yield "solves a sequence", _a_sequence_is_solved
-    for form in FORMS:
-        for change in changes_of(form):
-            yield (
-                f"{INVARIANCE_PREFIX}: {form}, {change}",
-                partial(_keeps_its_answer, form, change),
-            )
-
-
-CHECKS: Mapping[str, Check] = dict(_all_checks())
+#: The properties of a solver, by name.
+CHECKS: Mapping[str, Check] = {
+    **{
+        f"{SOLUTION_PREFIX}: {shape}": partial(_finds_the_planted_solution, shape)
+        for shape in SHAPES
+    },
+    **{
+        f"solves over {shape}": partial(_solves_over_sets, shape)
+        for shape in SET_SHAPES
+    },
+    **{
+        f"{name}: {shape}": partial(check, shape)
+        for name, check in (
+            ("reaches the tolerance", _reaches_the_tolerance),
+            ("leaves the problem alone", _the_problem_is_left_alone),
+        )
+        for shape in ACCEPTED_BY_MOST
+    },
+    "finds where a membrane of 400 nodes touches": _many_bounds_and_no_rows,
+    "gives multipliers our signs": _multipliers_have_our_signs,
+    "puts none on absent bounds": _absent_bounds_have_no_multipliers,
+    "starts every repeat cold, same answer": _repeats_are_cold_and_alike,
+    "remembers no answer": _remembers_no_answer,
+    "remembers no answer of a sequence": _remembers_no_sequence,
+    "refuses a misspelt option": _a_misspelt_option_is_refused,
+    "claims no success: infeasible": partial(_claims_no_success, infeasible),
+    "claims no success: unbounded": partial(_claims_no_success, unbounded),
+    "takes or declines an operator": _an_operator_is_taken_or_declined,
+    "computes in one thread": _runs_in_one_thread,
+    "solves a sequence": _a_sequence_is_solved,
+    **{
+        f"{INVARIANCE_PREFIX}: {form}, {change}": partial(
+            _keeps_its_answer, form, change
+        )
+        for form, changes in CHANGES_OF.items()
+        for change in changes
+    },
+}

@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from mortarbench.harness.conformance.manufactured import strings
+from mortarbench.harness.conformance.manufactured import FORMS, strings
 from mortarbench.harness.conformance.metamorphic import (
     Equivalent,
     Order,
@@ -55,12 +55,11 @@ class WeaknessError(Exception):
 
 
 def same_answer(
-    form: str, change: str, solver: Solver, old: Solution | None = None
+    form: str, change: str, solver: Solver
 ) -> tuple[int | None, int | None]:
     """Solve the unchanged and the changed string problem, and compare the answers.
 
     change : a key of `CHANGES`
-    old : the answer to the unchanged QP; None to compute this answer
 
     Returns
     -------
@@ -79,12 +78,12 @@ def same_answer(
 
     """
     qp = strings(form)
-    old = old or answer(solver, qp)
+    old, _ = solve_once(solver, qp, TOL)
     before = _fault(qp, old)
     if before and change != UNCHANGED:
         raise DeclinedError(f"not solved without the change: {before}")
     new = CHANGES[change](qp, form)
-    s = old if change == UNCHANGED else answer(solver, new.qp)
+    s = old if change == UNCHANGED else solve_once(solver, new.qp, TOL)[0]
     if after := _fault(new.qp, s):
         raise WeaknessError(after)
     recovered = new.recover(s)
@@ -93,11 +92,6 @@ def same_answer(
     _compare("objective", abs(qp.objective(recovered.x) - qp.objective(old.x)) / energy)
     _compare("½‖x − x₀‖²_P", 0.5 * float(dx @ (qp.P @ dx)) / energy)
     return old.iterations, s.iterations
-
-
-def answer(solver: Solver, qp: QP) -> Solution:
-    """Solve a QP at the tolerance `TOL`; raise DeclinedError if it is declined."""
-    return solve_once(solver, qp, TOL)[0]
 
 
 def _fault(qp: QP, s: Solution) -> str:
@@ -176,15 +170,13 @@ _ROWS = {
     "dual": ("rows", "equality rows"),
     "dual-bounds": (),
 }
-
-
-def changes_of(form: str) -> list[str]:
-    """Return the names of the changes that apply to a form, `UNCHANGED` first.
-
-    A change of equality or inequality rows applies only to forms with such rows.
-    """
-    return [
+#: Names of the changes that apply to each form, `UNCHANGED` first: a change of equality
+#: or inequality rows applies only to forms with such rows.
+CHANGES_OF: Mapping[str, list[str]] = {
+    form: [
         name
         for name in CHANGES
         if "rows" not in name or any(name.startswith(f"{r} ") for r in _ROWS[form])
     ]
+    for form in FORMS
+}

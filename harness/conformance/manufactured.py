@@ -48,47 +48,54 @@ def manufactured(
     >>> bool(np.allclose(qp.P @ point.x + qp.q + qp.A.T @ point.y, 0))
     True
     """
-    store: Callable[[Matrix], Matrix] = np.asarray if dense else csc_array
-    return _plant(np.random.default_rng(seed), n, store, SHAPES[shape])
-
-
-def _plant(
-    rng: np.random.Generator,
-    n: int,
-    store: Callable[[Matrix], Matrix],
-    shape: Mapping[str, Any],
-) -> tuple[QP, Solution]:
-    m, p, rank = (shape.get(k, v) for k, v in (("m", 0), ("p", 0), ("rank", n)))
-    lower, upper = shape.get("lower", True), shape.get("upper", True)
+    rng, kind = np.random.default_rng(seed), SHAPES[shape]
+    m, p, rank = (kind.get(k, v) for k, v in (("m", 0), ("p", 0), ("rank", n)))
+    lower, upper = kind.get("lower", True), kind.get("upper", True)
     M = rng.standard_normal((n, rank))
     P = M @ M.T / rank + (0.1 * np.eye(n) if rank == n else 0.0)
     A, G = rng.standard_normal((m, n)), rng.standard_normal((p, n))
-    if shape.get("redundant"):
+    if kind.get("redundant"):
         A[-1] = A[:-1].sum(axis=0)
-    x = rng.standard_normal(n)
-    y = rng.standard_normal(m)
+    x, y = rng.standard_normal(n), rng.standard_normal(m)
     # multipliers of active rows are at least 0.5, so that complementarity is strict
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
     # of every four variables, one is at its lower bound and one is at its upper bound,
     # if these bounds exist; no other bounds are active
     at_lb = lower & (np.arange(n) % 4 == 0)
     at_ub = upper & (np.arange(n) % 4 == 1)
-    bounded = np.arange(n) % 4 < 2 if shape.get("some") else np.full(n, True)
+    bounded = np.arange(n) % 4 < 2 if kind.get("some") else np.full(n, True)
     z_box = (0.5 + rng.exponential(size=n)) * (at_ub * 1.0 - at_lb)
-    fixed = at_lb if shape.get("fixed") else np.full(n, False)
     lb = np.where(lower & bounded, np.where(at_lb, x, x - 1), -np.inf)
     ub = np.where(upper & bounded, np.where(at_ub, x, x + 1), np.inf)
-    qp = QP(
+    if kind.get("fixed"):
+        ub = np.where(at_lb, lb, ub)
+    s = Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
+    return _planted(P, A, G, s, np.asarray if dense else csc_array, lb=lb, ub=ub), s
+
+
+def _planted(
+    P: Matrix,
+    A: Matrix,
+    G: Matrix,
+    s: Solution,
+    store: Callable[[Matrix], Matrix] = csc_array,
+    **bounds: Any,
+) -> QP:
+    """Return the QP with the KKT point `s`: q follows from stationarity.
+
+    Inequality rows with the multiplier zero have the slack 1.
+
+    bounds : arguments `lb`, `ub` and `sets` of the QP
+    """
+    return QP(
         P=store(P),
-        q=-(P @ x + A.T @ y + G.T @ z + z_box),
+        q=-(P @ s.x + A.T @ s.y + G.T @ s.z + s.z_box),
         A=store(A),
-        b=A @ x,
+        b=A @ s.x,
         G=store(G),
-        h=G @ x + np.where(z > 0, 0.0, 1.0),
-        lb=lb,
-        ub=np.where(fixed, lb, ub),
+        h=G @ s.x + (s.z == 0),
+        **bounds,
     )
-    return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
 #: Numbers of discs, of cones, and of rows of each type (A and G), by shape.
@@ -145,41 +152,13 @@ def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solut
     M, A = rng.standard_normal((n, n)), rng.standard_normal((rows, n))
     G, y = rng.standard_normal((rows, n)), rng.standard_normal(rows)
     z = np.where(np.arange(rows) == 0, 0.7, 0.0)
+    sets = (
+        Discs(on_discs.reshape(discs, 2), sizes[:discs]),
+        Cones(on_cones.reshape(cones, 3), slopes),
+    )
+    s = Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
     P = M @ M.T / n + 0.1 * np.eye(n)
-    qp = QP(
-        P=csc_array(P),
-        q=-(P @ x + A.T @ y + G.T @ z + z_box),
-        A=csc_array(A),
-        b=A @ x,
-        G=csc_array(G),
-        h=G @ x + (z == 0),
-        lb=lb,
-        ub=np.full(n, np.inf),
-        sets=(
-            Discs(on_discs.reshape(discs, 2), sizes[:discs]),
-            Cones(on_cones.reshape(cones, 3), slopes),
-        ),
-    )
-    return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
-
-
-def degenerate_cone() -> tuple[QP, Vector]:
-    """Return min ½‖x‖² − 4x₁ − 4x₂ over the cone ‖(x₂, x₃)‖ ≤ x₁, and x* = (4, 4, 0).
-
-    The unconstrained minimiser is on the boundary of the cone, so the multiplier is
-    zero. The error in x is therefore of the order of the square root of the error in
-    complementarity.
-    """
-    qp = QP(
-        P=csc_array(np.eye(3)),
-        q=np.array([-4.0, -4.0, 0.0]),
-        A=no_rows(3),
-        b=np.zeros(0),
-        G=no_rows(3),
-        h=np.zeros(0),
-        sets=(Cones(np.arange(3)[None], np.ones(1)),),
-    )
-    return qp, np.array([4.0, 4.0, 0.0])
+    return _planted(P, A, G, s, lb=lb, ub=np.full(n, np.inf), sets=sets), s
 
 
 def one_of_each() -> tuple[QP, dict[str, Vector]]:
@@ -190,15 +169,15 @@ def one_of_each() -> tuple[QP, dict[str, Vector]]:
     multipliers can be computed by hand.
     """
     inf = np.inf
-    qp = QP(
-        P=csc_array(np.eye(4)),
-        q=np.array([-3.0, 4.0, -5.0, -9.0]),
-        A=csc_array([[0.0, 0, 0, 2]]),
-        b=np.array([2.0]),
-        G=csc_array([[0.0, 0, 2, 0]]),
-        h=np.array([2.0]),
-        lb=np.array([-inf, -1, -inf, -inf]),
-        ub=np.array([1, inf, inf, inf]),
+    qp = QP.from_arrays(
+        csc_array(np.eye(4)),
+        [-3, 4, -5, -9],
+        G=csc_array([[0, 0, 2, 0]]),
+        h=2,
+        A=csc_array([[0, 0, 0, 2]]),
+        b=2,
+        lb=[-inf, -1, -inf, -inf],
+        ub=[1, inf, inf, inf],
     )
     vectors = dict(x=[1.0, -1, 1, 1], y=[4.0], z=[2.0], z_box=[2.0, -3, 0, 0])
     return qp, {name: np.array(v) for name, v in vectors.items()}
@@ -215,16 +194,10 @@ def membrane(k: int) -> QP:
     )
     eye = eye_array(k)
     x, y = np.meshgrid(*2 * [np.arange(1, k + 1) / (k + 1)])
-    n = k * k
-    return QP(
-        P=csc_array(kron(second, eye) + kron(eye, second)),
-        q=np.full(n, 8 / (k + 1) ** 2),
-        A=no_rows(n),
-        b=np.zeros(0),
-        G=no_rows(n),
-        h=np.zeros(0),
+    return QP.from_arrays(
+        csc_array(kron(second, eye) + kron(eye, second)),
+        np.full(k * k, 8 / (k + 1) ** 2),
         lb=(-0.1 - 0.3 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)).ravel(),
-        ub=np.full(n, np.inf),
     )
 
 
@@ -253,17 +226,10 @@ def strings(form: str) -> QP:
     G = np.hstack([-np.eye(25)[1:-1], np.transpose(weights)])
     h = 0.01 + 0.1 * (at - 0.4) ** 2
     ends = np.array([0, 24, 25, 41])
-    A, no_box = np.eye(42)[ends], np.full(42, np.inf)
+    A = np.eye(42)[ends]
     if form == "primal":
-        return QP(
-            P=csc_array(K),
-            q=-f,
-            A=csc_array(A),
-            b=np.zeros(4),
-            G=csc_array(G),
-            h=h,
-            lb=-no_box,
-            ub=no_box,
+        return QP.from_arrays(
+            csc_array(K), -f, csc_array(G), h, csc_array(A), np.zeros(4)
         )
     free = np.setdiff1d(np.arange(42), ends)
     if form == "dual":
@@ -307,27 +273,10 @@ def _two_strings() -> tuple[Vector, Vector, Vector]:
 def infeasible() -> QP:
     """Return a QP with the contradictory rows x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
     rows = np.eye(2, 20) - np.eye(2, 20)[::-1]
-    return QP(
-        P=csc_array(np.eye(20)),
-        q=np.ones(20),
-        A=no_rows(20),
-        b=np.zeros(0),
-        G=csc_array(rows),
-        h=-np.ones(2),
-        lb=np.full(20, -np.inf),
-        ub=np.full(20, np.inf),
-    )
+    return QP.from_arrays(csc_array(np.eye(20)), np.ones(20), csc_array(rows), [-1, -1])
 
 
 def unbounded() -> QP:
     """Return a QP that decreases linearly in x₀, a variable without upper bound."""
-    return QP(
-        P=csc_array(np.diag([0.0] + [1.0] * 19)),
-        q=-np.ones(20),
-        A=no_rows(20),
-        b=np.zeros(0),
-        G=no_rows(20),
-        h=np.zeros(0),
-        lb=np.full(20, -1.0),
-        ub=np.full(20, np.inf),
-    )
+    P = csc_array(np.diag([0.0] + [1.0] * 19))
+    return QP.from_arrays(P, -np.ones(20), lb=-1)

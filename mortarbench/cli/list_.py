@@ -46,9 +46,9 @@ your own solver with `--plugin FILE.py`. If the library of a solver is missing, 
 solver declines, and the message states the command that installs the library; `make
 setup` installs all libraries (the extra `fleet`).
 
-[weaknesses.md](weaknesses.md) shows how the answers of each solver change with the
-units, with the order of unknowns and rows, with scaled or repeated rows, and with
-shifted or mirrored unknowns.
+`make weaknesses` shows how the answers of each solver change with the units, with the
+order of unknowns and rows, with scaled or repeated rows, and with shifted or mirrored
+unknowns.
 """
 OURS = """\
 # Our solvers

@@ -513,8 +513,8 @@ _COMMANDS = {
             _Option(
                 _MARKDOWN,
                 "",
-                "print only how answers change under equivalent formulations, as in "
-                "docs/weaknesses.md",
+                "print only how answers change under equivalent formulations, as a "
+                "page",
             ),
             _JSON,
         ],

@@ -24,11 +24,7 @@ def run(registries: Registries, options: Namespace) -> int:
     ]
     for spec in specs:
         check_name(spec.name, registries.solvers)
-    from mortarbench.harness.conformance.conformance import (
-        CHECKS,
-        DEGENERATE,
-        INVARIANCE_PREFIX,
-    )
+    from mortarbench.harness.conformance.conformance import CHECKS, INVARIANCE_PREFIX
     from mortarbench.harness.conformance.weaknesses import weaknesses_page
     from mortarbench.progress import waiting
     from mortarbench.validation import test_solver
@@ -36,9 +32,7 @@ def run(registries: Registries, options: Namespace) -> int:
     for spec in specs:
         resolve(spec, registries.solvers)
     checks = [
-        c
-        for c in CHECKS
-        if c.startswith((INVARIANCE_PREFIX, DEGENERATE)) or not options.markdown
+        c for c in CHECKS if c.startswith(INVARIANCE_PREFIX) or not options.markdown
     ]
     results = []
     for spec in specs:

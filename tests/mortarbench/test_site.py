@@ -24,7 +24,7 @@ SOURCES = {
 }
 #: pages with Unicode formulas: generated pages and the change log
 UNICODE = {
-    "solvers.md", "solvers-own.md", "solvers-libraries.md", "weaknesses.md",
+    "solvers.md", "solvers-own.md", "solvers-libraries.md",
     "CHANGELOG.md",
 }  # fmt: skip
 #: characters that occur only in formulas, not in plain text

@@ -30,6 +30,7 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }  #: pages of the site by the name of the file in the root of the project
+WEAKNESSES = ROOT / "out" / "weaknesses.md"  #: page that `make weaknesses` measures
 #: formula in the output of pymdownx.arithmatex, displayed or inline
 FORMULA = re.compile(
     r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', re.DOTALL
@@ -49,6 +50,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, page in PAGES.items():
         text = from_root((ROOT / name).read_text("utf-8"))
         files.append(File.generated(config, page, content=text))
+    if WEAKNESSES.is_file():
+        content = WEAKNESSES.read_text("utf-8")
+        files.append(File.generated(config, WEAKNESSES.name, content=content))
+        config.nav = [*(config.nav or ()), {"Weaknesses of solvers": WEAKNESSES.name}]
     for notebook in sorted((ROOT / "docs" / "gallery").glob("*.ipynb")):
         for path, content in gallery_page(notebook).items():
             files.append(File.generated(config, path, content=content))
