@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from html import escape
 from pathlib import Path
 from sys import stderr
@@ -463,7 +462,6 @@ def solver_session(
     registries: Registries,
     options: Mapping[str, Any] | None = None,
     *,
-    forks: bool = False,
     ranks: int = 1,
     time_limit: float = TIME_LIMIT,
 ) -> Iterator[Callable[[Case, float], Answer]]:
@@ -471,8 +469,6 @@ def solver_session(
 
     solver, options, ranks, time_limit : see `solve`
     registries : registries that contain the solver; the process loads the same plug-ins
-    forks : True to allow a fork of this process as the solver process where a fork is
-        safe; see `harness.processes.forking`
 
     Raises
     ------
@@ -543,16 +539,11 @@ def solver_session(
             remarks=(*_of_input(case), *remarks(case, record, solution)),
         )
 
-    work = None
-    if forks and ranks == 1:
-        from mortarbench.harness.processes.worker import serve  # needed for forks only
-
-        work = partial(serve, configured)
     with scratch_folder() as scratch:
         copy = None if isinstance(solver, str) else scratch / "solver.pickle"
         if copy is not None:
             write_solver(copy, configured)
-        with single_worker(registries.worker_command(spec, copy), work) as worker:
+        with single_worker(registries.worker_command(spec, copy)) as worker:
             yield answer
 
 

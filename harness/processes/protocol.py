@@ -8,11 +8,9 @@ more events. The worker ends when the pipe of requests is closed.
 * Every other request is answered by ``{"event": "start"}``, at which the parent starts
   its clock, and by ``{"event": "done", …}`` with the answer. In a measurement, the
   worker sends ``{"event": "solved"}`` between these two events after the first solve,
-  and ``{"event": "timed"}`` after the last one, when its own clock has
-  stopped. The worker then waits for a line from the parent, so that the parent can read
-  the worker's CPU time. If MPI ranks build the QP of a case, rank 0 sends ``{"event":
-  "built", …}`` before "start". After "timed", and before the ranks evaluate the
-  answer, rank 0 sends ``{"event": "measured"}``.
+  and ``{"event": "timed"}`` after the last one, when its own clock has stopped. If MPI
+  ranks build the QP of a case, rank 0 sends ``{"event": "built", …}`` before "start",
+  and ``{"event": "measured"}`` before the ranks evaluate the answer.
 * ``{"event": "fault", "what": …}`` is sent instead of the next event if code of the
   harness fails.
 
@@ -45,8 +43,7 @@ class Events:
 
     start: Callable[[], None]  #: sends "start", at which the parent starts its clock
     solved: Callable[[], None]  #: sends "solved": the first solve has ended
-    #: sends "timed": the worker's clock has stopped. Returns after the parent has read
-    #: the CPU time
+    #: sends "timed": the worker's clock has stopped
     timed: Callable[[], None]
     #: sends "built" or "measured", with the entries of the event
     reached: Callable[[str, Mapping[str, Any]], None]
@@ -77,7 +74,7 @@ def answer_requests(
                 if "warm_up" in request:
                     reply = {"event": "warm", **(warm_up() or {})}
                 else:
-                    answer = handle(request, _events(requests, replies))
+                    answer = handle(request, _events(replies))
                     reply = {"event": "done", **answer}
                 sys.stdout.flush()  # the next request truncates the log
             # fault of the harness: `handle` and `warm_up` catch errors of solvers
@@ -88,18 +85,14 @@ def answer_requests(
             _send(replies, **reply)
 
 
-def _events(requests: TextIO, replies: TextIO) -> Events:
-    def timed() -> None:
-        _send(replies, event="timed")
-        requests.readline()
-
+def _events(replies: TextIO) -> Events:
     def reached(event: str, entries: Mapping[str, Any]) -> None:
         _send(replies, event=event, **entries)
 
     return Events(
         lambda: _send(replies, event="start"),
         lambda: _send(replies, event="solved"),
-        timed,
+        lambda: _send(replies, event="timed"),
         reached,
     )
 

@@ -6,12 +6,9 @@ alarm only after C code has returned, and some solvers ignore SIGTERM. A sub-rea
 is limited by polling the resident size, because RLIMIT_AS includes address space that
 libraries reserve and never touch. The module requires the /proc file system of Linux.
 
-The times that a worker reports are checked against the parent's clock and against the
-CPU time that the kernel counts. While one worker executes a request, all other workers
-on its CPU are stopped by SIGSTOP, so that running threads of one solver do not disturb
-the measurement of another solver. Requests from several threads are therefore
-serialised. Signals to a worker and its descendants are sent to pidfds, see
-pidfd_open(2), since the kernel reuses process IDs.
+All workers of a process share one CPU. Requests from several threads are therefore
+serialised, and a worker that uses CPU time while it is idle is replaced, so that
+running threads of one solver do not disturb the measurement of another solver.
 """
 
 from __future__ import annotations
@@ -33,12 +30,12 @@ from select import poll, select
 from typing import Any, ClassVar
 from weakref import WeakSet
 
+import psutil
+
 from mortarbench.harness import limits
 from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.processes import reaper
-from mortarbench.harness.processes.footprint import Footprint
-from mortarbench.harness.processes.forking import Fork, Serve, fork, is_safe
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.protocol import (
     MAX_REPLY_BYTES,
@@ -100,15 +97,6 @@ _MACHINE_FAILURE = re.compile(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clock:
-    """Times of a measurement on the parent's clock, which bound the worker's times."""
-
-    min_seconds: float  #: CPU time that the kernel counted between "start" and "timed"
-    elapsed_seconds: float  #: wall time between the receipts of "start" and "timed"
-    max_seconds: float  #: wall time from the request to "timed"
-
-
-@dataclass(frozen=True, kw_only=True)
 class Reply:
     """Result of a request: the worker's answer, or the reason why there is none."""
 
@@ -120,8 +108,8 @@ class Reply:
     #: True if the worker ended in a solve that repeats a completed solve
     in_repeats: bool = False
     peak_mib: float | None = None  #: largest memory that the parent observed
-    #: the parent's times of a measurement; None for other requests
-    clock: Clock | None = None
+    #: wall time from the request to "timed"; None if the request is not a measurement
+    elapsed_seconds: float | None = None
     threads: int | None = None  #: number of threads that the worker reported
     cpu: int | None = None  #: number of the CPU to which the worker is bound
     #: sizes, digest and build time of the QP that the worker built; None if it built
@@ -146,42 +134,35 @@ class WorkerProcess:
     def __init__(self, command: list[str], log: Path) -> None:
         self._command = command
         self._log = log
-        self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
+        self._process: subprocess.Popen[bytes] | None = None  # the sub-reaper
         self._worker = 0  # process ID of the worker, once it is ready
-        self._reaper_fd = self._worker_fd = -1  # pidfds; -1 if there is no process
-        self._cpu = -1
+        self._reaper_fd = -1  # pidfd; -1 if there is no process
         # file descriptors of the two pipes in this process
         self._requests = self._replies = -1
         self._unread = bytearray()
         self._warms_up = True
         self._is_warm = False
-        self._is_stopped = self._was_busy = False
         # True between the steps of a sequence that several processes solve
         self._keeps_ranks = False
+        self._was_replaced = False  # True if the idle worker used CPU time
         # time on the parent's clock and CPU time of the worker at the last answer
         self._idle_since: tuple[float, float] | None = None
         # number of threads and CPU of the worker; see `_facts`
         self._facts: dict[str, Any] = {}
-        self._footprint = Footprint()
         self._peak_mib = 0.0
         self._built: dict[str, Any] | None = None  # entries of the event "built"
         with _LOCK:
             self._all.add(self)
 
     @_LOCK
-    def fork(self, serve: Serve) -> None:
-        """Start the worker at once, as a fork of this process that calls `serve`.
+    def start(self) -> None:
+        """Start the process without waiting for it; the first request reports errors.
 
-        The fork replaces the command and inherits the loaded modules, see
-        `harness.processes.forking`. If forking is not safe or fails, the first request
-        starts the worker by its command. If the fork dies, its replacement is also
-        started by the command.
+        The worker then loads its libraries while this process does other work.
         """
-        if not is_safe():
-            return
         try:
-            self._spawn(inf, serve)
-        except (_WorkerEndError, OSError):
+            self._spawn(inf)
+        except OSError:
             self._kill()
 
     @_LOCK
@@ -201,20 +182,17 @@ class WorkerProcess:
         memory_limit : limit for all processes of the worker together, in MiB
         """
         self._peak_mib, self._built = 0.0, None
-        cpu = fastest_first(os.sched_getaffinity(0))[0]
-        # Stop other workers before this worker resumes, since two workers must never
-        # run on one CPU.
-        for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
-            worker._stop()
-        was_busy = self._resume()
-        notes = [REPLACEMENT_NOTE] if was_busy else []
+        for worker in tuple(self._all):
+            worker._end_if_busy()
+        notes = [REPLACEMENT_NOTE] * self._was_replaced
+        self._was_replaced = False
         while True:
             is_new = not self._is_warm
             try:
                 if is_new:
                     self._start(memory_limit)
                     self._is_warm = True
-                answer, clock = self._exchange(request, time_limit, memory_limit)
+                answer, elapsed = self._exchange(request, time_limit, memory_limit)
                 break
             except _WorkerEndError as end:
                 self._kill()
@@ -240,7 +218,7 @@ class WorkerProcess:
         return Reply(
             answer=answer,
             message="; ".join(dict.fromkeys(notes)),
-            clock=clock,
+            elapsed_seconds=elapsed,
             peak_mib=peak,
             built=self._built,
             **facts,
@@ -253,7 +231,6 @@ class WorkerProcess:
         The time limit is `CLOSE_SECONDS`.
         """
         try:
-            self._resume()
             self._close("_requests")
             deadline = time.monotonic() + CLOSE_SECONDS
             while time.monotonic() < deadline and not self._is_dead():
@@ -270,7 +247,7 @@ class WorkerProcess:
 
     def _exchange(
         self, request: Mapping[str, Any], time_limit: float, memory_limit: float
-    ) -> tuple[dict[str, Any], Clock | None]:
+    ) -> tuple[dict[str, Any], float | None]:
         with suppress(OSError):
             self._log.write_bytes(b"")
         sent = time.monotonic()
@@ -281,23 +258,13 @@ class WorkerProcess:
                 "built", time_limit, memory_limit, stage="build: "
             )
         self._await("start", START_SECONDS, memory_limit)
-        started, used = time.monotonic(), self._cpu_seconds()
         oom_kills = _oom_kills()
         try:
-            clock = None
+            elapsed = None
             if measures(request):
                 self._await("solved", time_limit, memory_limit)
                 self._await("timed", REPEAT_SECONDS, memory_limit)
-                ended = time.monotonic()
-                clock = Clock(
-                    min_seconds=min(self._cpu_seconds() - used, ended - started),
-                    elapsed_seconds=ended - started,
-                    max_seconds=ended - sent,
-                )
-                # The worker waits for "go", so it cannot close a file in shared memory
-                # before the file is recorded.
-                self._footprint.notice(self._tree())
-                self._send({"go": True})
+                elapsed = time.monotonic() - sent
             if is_shared:
                 self._await("measured", POINT_SECONDS, memory_limit)
                 peak = self._peak_mib  # exclude the memory of the evaluation
@@ -314,7 +281,7 @@ class WorkerProcess:
             end.is_oom = end.signal == signal.SIGKILL and _oom_kills() > oom_kills
             raise
         self._trim_log()
-        return answer, clock
+        return answer, elapsed
 
     def _reply_to_end(self, end: _WorkerEndError, memory_limit: float) -> Reply:
         """Diagnose the end of a worker: a verdict on the solver, or a fault."""
@@ -353,6 +320,7 @@ class WorkerProcess:
         """
         if self._process is None:
             self._spawn(memory_limit)
+        self._await_ready(memory_limit)
         for is_last in (False, True):
             if not self._warms_up:
                 return
@@ -366,11 +334,10 @@ class WorkerProcess:
                 self._warms_up = end.signal in _EXTERNAL_SIGNALS and not is_last
                 self._kill()
                 self._spawn(memory_limit)
+                self._await_ready(memory_limit)
 
-    def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
-        """Start a fork that calls `serve`, or the command if `serve` is None."""
-        self._cpu = fastest_first(os.sched_getaffinity(0))[0]
-        self._footprint = Footprint()
+    def _spawn(self, memory_limit: float) -> None:
+        cpu = fastest_first(os.sched_getaffinity(0))[0]
         self._unread = bytearray()
         their_requests, self._requests = _pipe()
         self._replies, their_replies = _pipe()
@@ -382,45 +349,35 @@ class WorkerProcess:
             # `_trim_log`. Otherwise, a write at the old offset would restore the old
             # length of the file.
             with self._log.open("ab") as log:
-                if serve is not None:
-                    self._process = fork(
-                        serve,
-                        cpu=self._cpu,
-                        pipes=pipes,
-                        log=log.fileno(),
-                        environment=environment,
-                    )
-                else:
-                    self._process = subprocess.Popen(
-                        [
-                            sys.executable,
-                            "-I",
-                            "-S",
-                            reaper.__file__,
-                            str(self._cpu),
-                            *map(str, pipes),
-                            *self._command,
-                        ],
-                        # if this process dies, the kernel closes the pipe, which ends
-                        # the tree
-                        stdin=subprocess.PIPE,
-                        stdout=log,
-                        stderr=log,
-                        env=os.environ | environment,
-                        pass_fds=pipes,
-                        start_new_session=True,
-                    )
+                self._process = subprocess.Popen(
+                    [
+                        sys.executable,
+                        "-I",
+                        "-S",
+                        reaper.__file__,
+                        str(cpu),
+                        *map(str, pipes),
+                        *self._command,
+                    ],
+                    # if this process dies, the kernel closes the pipe, which ends the
+                    # tree
+                    stdin=subprocess.PIPE,
+                    stdout=log,
+                    stderr=log,
+                    env=os.environ | environment,
+                    pass_fds=pipes,
+                    start_new_session=True,
+                )
         finally:
             os.close(their_requests)
             os.close(their_replies)
         self._reaper_fd = os.pidfd_open(self._process.pid)
+
+    def _await_ready(self, memory_limit: float) -> None:
+        assert self._process is not None
         self._await("ready", START_SECONDS, memory_limit)
         for worker in self._tree()[:1]:  # the tree lists a parent before its children
-            self._worker_fd = os.pidfd_open(worker)
-            # If the process ID is still in the tree after pidfd_open, the pidfd refers
-            # to the worker, not to an unrelated process that reuses its ID.
-            if worker in self._tree():
-                self._worker = worker
+            self._worker = worker
         if not self._worker:
             raise OSError(f"/proc lists no process below {self._process.pid}")
 
@@ -465,7 +422,7 @@ class WorkerProcess:
                 raise ended(Verdict.CRASHED, *self._death())
             if time.monotonic() > deadline:
                 raise ended(Verdict.TIME_LIMIT, f"killed after {limit:g} s")
-            memory = self._footprint.mib(self._tree(), memory_limit)
+            memory = _memory_mib(self._tree(), memory_limit)
             self._peak_mib = max(self._peak_mib, memory)
             if memory > memory_limit:
                 how = f"killed at {memory:.0f} MiB, above the limit of {memory_limit:g}"
@@ -525,44 +482,15 @@ class WorkerProcess:
             return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
         return 0.0
 
-    def _stop(self) -> None:
-        if self._process is None or self._is_stopped:
-            return
-        if self._keeps_ranks:
-            return  # its processes sleep until the next step
-        if self._others():
-            self._kill()  # SIGSTOP would miss processes started after the answer
-            return
-        self._was_busy = self._was_busy or self._has_been_busy()
-        self._signal(signal.SIGSTOP)
-        self._is_stopped = True
-
-    def _resume(self) -> bool:
-        """Resume the worker after `_stop`; return True if it was busy between requests.
-
-        A worker that was busy or has died is killed, and the next request replaces it.
-        """
-        if self._process is None:
-            return False
-        if self._is_stopped:
-            self._signal(signal.SIGCONT)
-            self._is_stopped = False
-        else:
-            self._was_busy = self._has_been_busy()
-        was_busy, self._was_busy = self._was_busy, False
-        if was_busy or self._is_dead():
-            self._kill()
-        return was_busy
-
-    def _signal(self, number: signal.Signals) -> None:
-        """Send a signal to the worker, if it is running."""
-        if self._worker_fd != -1:
-            with suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._worker_fd, number)
+    def _end_if_busy(self) -> None:
+        """Kill the worker if it has died, or used CPU time since its last answer."""
+        if self._process is not None and self._idle_since is not None:
+            self._was_replaced |= self._has_been_busy()
+            if self._was_replaced or self._is_dead():
+                self._kill()
 
     def _has_been_busy(self) -> bool:
-        if self._idle_since is None:
-            return False
+        assert self._idle_since is not None
         since, used = self._idle_since
         allowed = max(
             MIN_BUSY_CPU_SECONDS, MAX_IDLE_CPU_SHARE * (time.monotonic() - since)
@@ -625,9 +553,8 @@ class WorkerProcess:
         return (f"{how}: {last}" if last else how), number
 
     def _kill(self) -> None:
-        """Kill the worker and its descendants, and remove their shared-memory files."""
+        """Kill the worker and its descendants."""
         if self._process is not None:
-            self._footprint.notice(self._tree())
             if not self._is_dead():
                 reaper.kill_descendants(self._process.pid)
             if self._process.stdin is not None:
@@ -639,7 +566,6 @@ class WorkerProcess:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-            self._footprint.remove_shared()
         self._forget()
 
     def _disown(self) -> None:
@@ -655,9 +581,8 @@ class WorkerProcess:
     def _forget(self) -> None:
         self._process = None
         self._is_warm = self._keeps_ranks = False
-        self._worker, self._is_stopped, self._was_busy = 0, False, False
-        self._idle_since = None
-        for name in ("_replies", "_requests", "_reaper_fd", "_worker_fd"):
+        self._worker, self._idle_since = 0, None
+        for name in ("_replies", "_requests", "_reaper_fd"):
             self._close(name)
 
     def _close(self, name: str) -> None:
@@ -669,6 +594,29 @@ class WorkerProcess:
 
 
 os.register_at_fork(after_in_child=WorkerProcess.forget_all)
+
+
+def _memory_mib(tree: list[int], limit: float) -> float:
+    """Return the memory of a tree of processes, in MiB.
+
+    The sum of resident sizes counts a shared page once per process. If the sum over
+    several processes exceeds `limit`, in MiB, the proportional set sizes are added
+    instead, for which the kernel has to walk all page tables.
+    """
+    processes = []
+    for number in tree:
+        with suppress(psutil.Error):
+            processes.append(psutil.Process(number))
+    total = 0
+    for process in processes:
+        with suppress(psutil.Error):
+            total += process.memory_info().rss
+    if total > limit * 2**20 and len(processes) > 1:
+        total = 0
+        for process in processes:
+            with suppress(psutil.Error):
+                total += process.memory_full_info().pss
+    return total / 2**20
 
 
 def _pipe() -> tuple[int, int]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 from argparse import Namespace
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -61,12 +59,10 @@ def run(registries: Registries, options: Namespace) -> int:
 
     pictures = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
     is_builtin = registries.hold_only_builtins()
-    forks = is_builtin and not _imports_from_working_directory()
     session = solver_session(
         options.solver,
         registries,
         changed,
-        forks=forks,
         ranks=options.mpi,
         time_limit=options.time_limit,
     )
@@ -74,7 +70,7 @@ def run(registries: Registries, options: Namespace) -> int:
         progress(f"building {parsed.name}")
         case = Case(id=parsed, registries=registries)
         if pictures or options.mpi == 1 or not is_builtin:
-            # built after the fork, so that the worker does not inherit the memory
+            # built while the worker starts
             _build(case, pictures)
         limit = f"time limit {options.time_limit:g} s"
         progress(f"solving {parsed.name} with {options.solver}, {limit}")
@@ -154,17 +150,6 @@ def _hint(answer: Answer) -> str:
     except Exception:  # code of a plug-in failed: no hint
         return ""
     return "" if reason else f"; dualise inequality rows first: solve {dual}"
-
-
-def _imports_from_working_directory() -> bool:
-    """Return True if libraries may have been imported from the working directory.
-
-    ``python -m`` searches this directory first, but workers do not, because they are
-    started with -P. A fork of this process could therefore use libraries other than
-    those of the worker of a run.
-    """
-    first, *others = sys.path
-    return first in ("", os.getcwd()) and first not in others
 
 
 def _write(answer: Answer, options: Namespace) -> None:
