@@ -20,7 +20,7 @@ from mortarbench.harness.conformance.conformance import (
     Grade,
     Result,
 )
-from mortarbench.harness.crossval.comparison import brief
+from mortarbench.harness.crossval.comparison import Outcome, brief
 from mortarbench.harness.crossval.summary import as_data
 from mortarbench.harness.crossval.validation import validate_folder
 from mortarbench.harness.errors import InputError, shown, some, unknown
@@ -50,8 +50,8 @@ class Validation:
     pages: tuple[Path, ...]  #: files of the page on the validation
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON, without the details of each problem."""
-        return {k: v for k, v in self.data.items() if k != "problems"}
+        """Return plain data for JSON."""
+        return dict(self.data)
 
     def __repr__(self) -> str:
         return as_text(self.data)
@@ -102,43 +102,25 @@ def validate(
     families = registries.families_with_copies(path)
     result = validate_folder(path, families, registries.reference, progress, budget)
     data = as_data(result, path.resolve().name)
-    if not (data["counts"]["answers"] or result.false_claims or result.proven):
-        reasons = [entry.text for entry in result.not_validated]
-        why = reasons[0] if reasons else "no answer claims a solution"
-        raise InputError(f"{path}: no stored answer can be judged: {why}")
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
         replace_file(path / "validation.json", text.encode())
     pages = tuple(registries.validation_page(path, data))
-    return Validation(agreed=result.agreed, data=data, pages=pages)
+    return Validation(agreed=data["agreed"], data=data, pages=pages)
 
 
 def as_text(data: Mapping[str, Any]) -> str:
     """Return the data of `harness.crossval.summary.as_data` as text for a terminal."""
     parts = [printable(data["headline"]), _solvers(data["solvers"])]
-    entries = {
-        "Refuted claims": _refuted(data["disagreements"]),
-        "Certificates contradicted (an error of this program)": [
-            f"{_measured(d)}: {d['text']}" for d in data["contradictions"]
-        ],
-        "Not validated": _count_equal(data["not_validated"]),
-        "Without a reference": [
-            f"{d['problem']}: {d['text']}" for d in data["without_reference"]
-        ],
-    }
-    parts += [_list(title, lines) for title, lines in entries.items() if lines]
-    counts = [
-        f"{data['counts'][key]} {words}"
-        for key, words in (
-            (
-                "remarks",
-                "remarks on stored points whose claims stand, see the page",
-            ),
-            ("unanswered", "measurements ended without a claim of success"),
-        )
-        if data["counts"][key]
-    ]
-    parts += ["; ".join(counts) + "."] if counts else []
+    for title, outcome in (
+        ("Refuted claims", Outcome.REFUTED),
+        ("Certificates contradicted (an error of this program)", Outcome.CONTRADICTED),
+        ("Not validated", Outcome.NOT_VALIDATED),
+    ):
+        if lines := _listed(data["answers"], outcome):
+            parts.append("\n".join([f"{title}:", *lines]))
+    if unanswered := data["counts"]["unanswered"]:
+        parts.append(f"{unanswered} measurements ended without a claim of success.")
     return "\n\n".join(parts)
 
 
@@ -147,8 +129,6 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
     columns = {
         "error_median": "error: median",
         "error_worst": "worst",
-        "penetration": "penetration/h",
-        "balance": "balance",
         "primal_dual": "primal-dual",
     }
     head = ["solver", "tol", "answers", "refuted", "unanswered", *columns.values()]
@@ -168,44 +148,17 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return one line per refuted claim or, if there are many, the worst per solver."""
-    if len(wrong) <= _MAX_ENTRIES:
-        return list(map(_wrong, wrong))
-    by_solver: dict[str, list[Mapping[str, Any]]] = {}
-    for d in wrong:
-        by_solver.setdefault(d["solver"], []).append(d)
-    return [
-        f"{_wrong(max(claims, key=lambda d: d['error'] or 0.0))}"
-        + (f" (the worst of {len(claims)})" if len(claims) > 1 else "")
-        for claims in by_solver.values()
+def _listed(answers: Sequence[Mapping[str, Any]], outcome: Outcome) -> list[str]:
+    """Return a line for each solver and reason with this outcome, worst error first."""
+    chosen = [a for a in answers if a["outcome"] == outcome]
+    chosen.sort(key=lambda a: -(a["bound"] or 0.0))
+    counted = Counter((a["solver"], a["case"], a["text"]) for a in chosen)
+    lines = [
+        f"  {printable(f'{solver} on {case}: {text}')}" + f" ({n} answers)" * (n > 1)
+        for (solver, case, text), n in counted.items()
     ]
-
-
-def _wrong(d: Mapping[str, Any]) -> str:
-    error = f"; error {_e(d['error'])}" if d["error"] is not None else ""
-    return f"{_measured(d)}: {'; '.join(d['reasons'])}{error}"
-
-
-def _measured(d: Mapping[str, Any]) -> str:
-    return f"{d['solver']} on {d['case']}, tol {d['tol']:g}"
-
-
-def _count_equal(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return one line for each distinct pair of case and text, with its frequency."""
-    counted = Counter((d["case"], d["text"]) for d in entries)
-    return [
-        f"{case} ({n} answer{'s' * (n != 1)}): {text}"
-        for (case, text), n in counted.items()
-    ]
-
-
-def _list(title: str, lines: Sequence[str]) -> str:
-    shown = [f"  {printable(line)}" for line in lines[:_MAX_ENTRIES]]
     more = len(lines) - _MAX_ENTRIES
-    if more > 0:
-        shown.append(f"  … and {more} more, see the page")
-    return "\n".join([f"{title}:", *shown])
+    return lines[:_MAX_ENTRIES] + [f"  … and {more} more, see the page"] * (more > 0)
 
 
 def _e(value: float | None) -> str:

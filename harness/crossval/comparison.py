@@ -1,235 +1,310 @@
-"""Comparison of all answers to one problem with a reference.
+"""Comparison of the answers to one problem with a reference solution.
 
-The reference is a point with an error bound (`harness.crossval.ground_truth`), which is
-computed independently of the solvers under test if the reference solve succeeds. A
-claim of success is refuted if a residual is too large, if a multiplier is inadmissible,
-or if the distance of the answer to the reference, minus the error bound
-of the reference, exceeds the error that the claim permits
-(`harness.crossval.assessment`). Agreement of several answers is not used as evidence.
+Let u and λ be the displacement and the multipliers of an answer, and u* and λ* those of
+the reference, which is computed independently of the solvers under test
+(`harness.crossval.references`). Let ‖·‖ be the energy norm, and u_λ the displacement in
+equilibrium with the load and the contact forces −Bᵀλ. An answer is verified at
+tolerance t if its KKT residuals are at most 10t. The residual of the duality gap g is
+g/E with an energy E; here, E is taken to be ‖u*‖². By the identity of Prager and Synge
+(`harness.verify.certificate`, (2)),
+
+    ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
+
+so that a verified answer has errors ‖u − u*‖ and ‖u_λ − u*‖ of at most √(20t)‖u*‖. The
+error ‖u_λ − u*‖ equals the error ‖Bᵀ(λ − λ*)‖ of the contact forces in the dual norm.
+It is used instead of the error of λ, since the multipliers need not be unique.
+
+A claim of success is refuted if a residual exceeds 10t, or if an error, minus the error
+bound of the reference, exceeds √(20t)‖u*‖. Agreement of several answers is not used as
+evidence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from mortarbench.harness.crossval.assessment import (
-    Assessment,
-    energy_allowed,
-)
-from mortarbench.harness.crossval.ground_truth import (
-    GroundTruth,
-    StoredAnswer,
-    ground_truth_of,
-    nan_last,
-    residuals_of,
-)
-from mortarbench.harness.errors import some
-from mortarbench.harness.plugin import Reference
-from mortarbench.harness.qp import Vector
-from mortarbench.harness.record import Verdict
-from mortarbench.harness.solution import Status
-from mortarbench.harness.verify.kkt import allowed, verdict
+from mortarbench.harness.crossval.references import UnsolvedError, reference_point
+from mortarbench.harness.mechanics import Extended, Mechanics, Real
+from mortarbench.harness.plugin import Case, Reference
+from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.record import Record
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.active_set_refinement import equilibrium
+from mortarbench.harness.verify.kkt import allowed, kkt_residuals, verdict
 from mortarbench.harness.verify.verdicts import note_of
+
+#: Largest KKT residual of a reference of a QP without mechanics.
+MAX_REFERENCE_RESIDUAL = 1e-3
+
+
+class Outcome(StrEnum):
+    """Result of the cross-validation of one answer."""
+
+    AGREES = "agrees"
+    REFUTED = "refuted"  #: the claim of the solver is false
+    CONTRADICTED = "contradicted"  #: the reference contradicts a certificate of the run
+    PROVEN = "proven"  #: a certificate proves the claim that there is no solution
+    UNANSWERED = "unanswered"  #: the solver does not claim to have an answer
+    NOT_VALIDATED = "not validated"  #: the answer cannot be judged
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """An answer with its verdict, its errors and the reasons that refute it."""
+    """An answer with its outcome and its errors; unknown values are None.
+
+    Errors are in the energy norm, relative to ‖u*‖; see the docstring of this module.
+    For a QP without mechanics, errors are in the seminorm of P.
+    """
 
     run_id: str  #: `Record.identity`
-    repeats: int  #: number of measurements that returned exactly this point
-    solver: str
+    solver: str  #: label; for a step of a sequence, the label includes the mode
     case: str
     form: str
     tol: float
     claimed: str
-    stored: Verdict  #: verdict that the run stored
-    verdict: Verdict  #: verdict on the stored point, evaluated again
-    #: the four residuals of `harness.verify.kkt` by name
-    residuals: Mapping[str, float]
-    allowed: float  #: largest residual of a verified answer
-    energy_allowed: float  #: largest permitted relative error in the energy norm
-    energy_bound: float | None  #: certified error bound that the run stored
-    doubt: float | None  #: bound on the relative error of the reference point
-    assessment: Assessment | None
-    refuted: tuple[str, ...] = ()  #: reasons why the claim is false
-    #: description of a contradiction between the certified bound of the run and the
-    #: reference, which indicates a defect of mortarbench; empty without contradiction
-    contradiction: str = ""
-    remarks: tuple[str, ...] = ()  #: anomalies of the stored point
+    outcome: Outcome
+    text: str = ""  #: reasons for the outcome, and anomalies of the stored point
+    residual: float | None = None  #: largest KKT residual of the stored point
+    error: float | None = None  #: ‖u − u*‖
+    force_error: float | None = None  #: ‖u_λ − u*‖
+    reference_error: float | None = None  #: bound on the error of the reference
 
     @property
-    def error(self) -> float | None:
-        """Bound on the relative errors of displacement and contact forces, or None."""
-        if self.assessment is None or self.doubt is None:
+    def bound(self) -> float | None:
+        """Bound on the errors of displacement and contact forces, or None."""
+        if self.error is None or self.reference_error is None:
             return None
-        a = self.assessment
-        return max(a.error, a.equilibrium_error or 0.0) + self.doubt
+        return max(self.error, self.force_error or 0.0) + self.reference_error
 
 
-class FormDistance(NamedTuple):
-    """Largest distance between primal and dual answers of one solver."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StoredAnswer:
+    """A stored point, with the case that was rebuilt for it."""
 
-    solver: str
-    tol: float
-    distance: float  #: ‖u − u'‖ in the energy norm, relative to ‖u*‖
+    record: Record
+    case: Case
+    solution: Solution
+    remark: str = ""  #: anomaly of the stored point
 
 
-@dataclass(frozen=True, kw_only=True)
-class Problem:
-    """The answers of all solvers to one problem, in all its forms."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Compared:
+    """The answers to one problem."""
 
-    name: str  #: name of the case without its form
-    #: origin of the reference point: "reference", or the solver and form of the best
-    #: answer; empty if there is no reference point
-    truth: str
-    #: bound on the relative error of the reference in the energy norm
-    doubt: float | None
-    closed: int | None  #: number of closed rows at the reference point
     answers: tuple[Answer, ...]
-    primal_dual: tuple[FormDistance, ...]
-    note: str = ""  #: reason why the reference is missing or replaced
+    #: bound on the error of the reference; None without a reference
+    reference_error: float | None
+    #: largest distance ‖u − u'‖/‖u*‖ between primal and dual answers of one solver, by
+    #: solver and tolerance
+    primal_dual: dict[tuple[str, float], float]
 
 
-def compare_answers(
-    name: str,
-    answers: Sequence[StoredAnswer],
-    solve: Reference,
-) -> Problem:
-    """Assess all answers to one problem.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Reference:
+    """A reference solution, the norm of its problem, and the errors of answers."""
+
+    bound: float  #: bound on its relative error
+    norm: Callable[[Any], float]  #: energy norm of a difference of displacements
+    length: float  #: ‖u*‖
+    #: returns u − u* and, with mechanics, u_λ − u* of an answer
+    errors: Callable[[StoredAnswer], tuple[Extended | Vector, Extended | None]]
+
+
+def answer_of(r: Record, outcome: Outcome, text: str) -> Answer:
+    """Return an answer without errors."""
+    return Answer(
+        run_id=r.identity,
+        solver=r.solver,
+        case=r.case,
+        form=r.form,
+        tol=r.tol,
+        claimed=r.claimed or "",
+        outcome=outcome,
+        text=text,
+    )
+
+
+def energy_allowed(tol: float) -> float:
+    """Return √(20 tol), a bound on the relative error of answers verified at `tol`."""
+    return float(np.sqrt(2 * allowed(tol)))
+
+
+@np.errstate(all="ignore")  # components of a point may be as large as 1e300
+def compare_answers(answers: Sequence[StoredAnswer], solve: Reference) -> Compared:
+    """Judge all answers to one problem.
+
+    Without a reference, answers are judged by their residuals alone.
 
     answers : answers to cases with equal ``mechanics.program``, or to a single QP
         without mechanics
     solve : function that solves a QP accurately
     """
-    truth = ground_truth_of(answers, solve)
-    if isinstance(truth, str):
-        unassessed = tuple(_answer(g, None, None) for g in answers)
-        return Problem(
-            name=name,
-            truth="",
-            doubt=None,
-            closed=None,
-            answers=unassessed,
-            primal_dual=(),
-            note=truth,
+    case = answers[0].case
+    try:
+        if case.mechanics is None:
+            reference = _plain_reference(case.qp, solve)
+        else:
+            reference = _elastic_reference(case.mechanics.whole, solve)
+    except Exception as e:  # also raised by code of the family
+        why = str(e) if isinstance(e, UnsolvedError) else note_of("reference", e)
+        return Compared(
+            answers=tuple(_judged(g, why) for g in answers),
+            reference_error=None,
+            primal_dual={},
         )
     judged, deviations = [], []
     for g in answers:
         try:
-            assessment, deviation = truth.assess(g)
+            off, force_off = reference.errors(g)
         except Exception as e:  # raised by code of the family
-            g = replace(g, remarks=(*g.remarks, note_of("distance", e)))
-            judged.append(_answer(g, None, None))
+            judged.append(_judged(g, note_of("distance", e)))
             continue
-        judged.append(_answer(g, assessment, truth.doubt))
-        deviations.append((judged[-1], deviation))
-    return Problem(
-        name=name,
-        truth=truth.name,
-        doubt=truth.doubt,
-        closed=truth.closed,
-        answers=tuple(judged),
-        primal_dual=tuple(_between_forms(deviations, truth)),
-        note=truth.note,
-    )
-
-
-def _answer(
-    g: StoredAnswer, assessment: Assessment | None, doubt: float | None
-) -> Answer:
-    """Determine the verdict on one answer, and the reasons why its claim is false."""
-    r, residuals, tol = g.record, residuals_of(g), g.record.tol
-    answer = Answer(
-        run_id=r.identity,
-        repeats=g.repeats,
-        solver=g.label,
-        case=r.case,
-        form=r.form,
-        tol=tol,
-        claimed=r.claimed or "",
-        stored=r.verdict,
-        verdict=verdict(g.solution.status, residuals, tol),
-        residuals=residuals._asdict(),
-        allowed=allowed(tol),
-        energy_allowed=energy_allowed(tol),
-        energy_bound=r.energy_bound,
-        doubt=doubt,
-        assessment=assessment,
-        remarks=g.remarks,
-    )
-    return replace(
-        answer,
-        refuted=tuple(_refutations(answer)),
-        contradiction=_contradiction(answer),
-    )
-
-
-def _contradiction(a: Answer) -> str:
-    """Describe an error that exceeds the bound certified in the run, or return "".
-
-    The result is "" for a point with remarks, and for a point whose new verdict differs
-    from the stored verdict. In both cases, the point may differ from the certified
-    point. Certified bounds above 1 % are not examined.
-    """
-    if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
-        return ""
-    least = a.assessment.error - a.doubt
-    if a.verdict is not a.stored or a.energy_bound > 0.01:
-        return ""
-    if least <= 1.01 * a.energy_bound + 1e-15:
-        return ""
-    return f"error {brief(least)}, certified at most {brief(a.energy_bound)}"
-
-
-def _refutations(a: Answer) -> Iterable[str]:
-    """Yield the reasons why a claim of success is false; nothing for other claims."""
-    if a.claimed != Status.SOLVED:
-        return
-    if a.verdict is not Verdict.VERIFIED:
-        name = max(a.residuals, key=lambda n: nan_last(a.residuals[n]))
-        yield f"{name} residual {brief(a.residuals[name])} > {brief(a.allowed)}"
-    if a.assessment is None or a.doubt is None:
-        return
-    plain = a.assessment.equilibrium_error is None  # a QP without mechanics
-    off = [
-        f"error of {what} {brief(error)}"
-        for what, error in (
-            ("x" if plain else "displacement", a.assessment.error),
-            ("contact forces", a.assessment.equilibrium_error),
+        error, force_error = (
+            None if v is None else _over(reference.norm(v), reference.length)
+            for v in (off, force_off)
         )
-        if error is not None and error - a.doubt > a.energy_allowed
-    ]
-    if off:
-        most = brief(a.energy_allowed)
-        yield f"{', '.join(off)} in the energy norm, allowed {most}"
-    if a.assessment.pulls:
-        yield f"inadmissible multipliers at rows {some(map(str, a.assessment.pulls))}"
-
-
-@np.errstate(all="ignore")  # components of a point may be as large as 1e300
-def _between_forms(
-    deviations: Sequence[tuple[Answer, Vector]], truth: GroundTruth
-) -> Iterator[FormDistance]:
-    """Yield the largest distance between primal and dual answers of each solver.
-
-    deviations : answers and their differences (u − u*)/‖u*‖ from the reference
-    """
-    if truth.norm is None:
-        return
-    largest: dict[tuple[str, float], float] = {}
+        judged.append(
+            _judged(
+                g,
+                error=error,
+                force_error=force_error,
+                reference_error=reference.bound,
+            )
+        )
+        deviations.append((judged[-1], off))
+    primal_dual: dict[tuple[str, float], float] = {}
     for (a, u), (b, v) in combinations(deviations, 2):
         key = a.solver, a.tol
         if key == (b.solver, b.tol) and (a.form == "primal") != (b.form == "primal"):
-            distance = nan_last(truth.norm(u - v))
-            largest[key] = max(largest.get(key, 0.0), distance)
-    for (solver, tol), distance in largest.items():
-        yield FormDistance(solver, tol, distance)
+            distance = _over(reference.norm(u - v), reference.length)
+            primal_dual[key] = max(primal_dual.get(key, 0.0), distance)
+    return Compared(
+        answers=tuple(judged),
+        reference_error=reference.bound,
+        primal_dual=primal_dual,
+    )
+
+
+def _elastic_reference(mechanics: Mechanics, solve: Reference) -> _Reference:
+    """Return the certified solution of an elastic problem.
+
+    If ‖u*‖ = 0, errors are relative to the energy norm of the displacement under the
+    load without contact.
+    """
+    point, exact = reference_point(mechanics, solve), mechanics.exact
+
+    def errors(g: StoredAnswer) -> tuple[Extended, Extended]:
+        assert g.case.mechanics is not None
+        s = g.case.mechanics.to_primal(g.solution)
+        force = exact.f - exact.B.T @ mechanics.multipliers(s).astype(Real)
+        at_rest, _ = equilibrium(mechanics, force)
+        return s.x.astype(Real) - point.u, at_rest - point.equilibrium
+
+    return _Reference(
+        bound=point.bound,
+        norm=mechanics.norm,
+        length=point.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0]),
+        errors=errors,
+    )
+
+
+def _plain_reference(qp: QP, solve: Reference) -> _Reference:
+    """Return the solution of a QP without mechanics; raise UnsolvedError if it is bad.
+
+    Errors do not depend on the choice of the solution, since Px is equal for all
+    solutions. The assumed bound on the error of the reference is √(2r), where r is its
+    largest KKT residual. For verified answers, the same formula holds with the largest
+    permitted r. The scale of errors is √max(x*ᵀPx*, |qᵀx*|).
+    """
+    truth = solve(qp)
+    worst = kkt_residuals(qp, truth).worst
+    if not worst <= MAX_REFERENCE_RESIDUAL:
+        raise UnsolvedError(f"the reference solve left a KKT residual of {worst:.1e}")
+    return _Reference(
+        bound=float(np.sqrt(2 * worst)),
+        norm=lambda v: float(np.sqrt(max(v @ (qp.P @ v), 0.0))),
+        length=float(np.sqrt(max(truth.x @ (qp.P @ truth.x), abs(qp.q @ truth.x)))),
+        errors=lambda g: (g.solution.x - truth.x, None),
+    )
+
+
+def _judged(
+    g: StoredAnswer,
+    unassessed: str = "",
+    *,
+    error: float | None = None,
+    force_error: float | None = None,
+    reference_error: float | None = None,
+) -> Answer:
+    """Return an answer with its outcome.
+
+    unassessed : reason why the errors are unknown
+    """
+    r = g.record
+    residuals = kkt_residuals(g.case.qp, g.solution)
+    answer = replace(
+        answer_of(r, Outcome.AGREES, ""),
+        residual=residuals.worst,
+        error=error,
+        force_error=force_error,
+        reference_error=reference_error,
+    )
+    now = verdict(g.solution.status, residuals, answer.tol)
+    reasons = list(_refutations(answer)) if r.claimed == Status.SOLVED else []
+    if reasons:
+        outcome = Outcome.REFUTED
+    elif unassessed:
+        outcome, reasons = Outcome.NOT_VALIDATED, [unassessed]
+    # the certificate of the run is of another point if there is a remark
+    elif now is r.verdict and not g.remark and (broken := _contradiction(answer, r)):
+        outcome, reasons = Outcome.CONTRADICTED, [broken]
+    else:
+        outcome = Outcome.AGREES
+    text = "; ".join([*reasons, *[g.remark] * bool(g.remark)])
+    return replace(answer, outcome=outcome, text=text)
+
+
+def _refutations(a: Answer) -> Iterator[str]:
+    """Yield the reasons why a claim of success is false."""
+    assert a.residual is not None
+    if not a.residual <= allowed(a.tol):
+        yield f"KKT residual {brief(a.residual)} > {brief(allowed(a.tol))}"
+    if a.reference_error is None:
+        return
+    most = energy_allowed(a.tol)
+    for what, error in (
+        ("x" if a.force_error is None else "displacement", a.error),
+        ("contact forces", a.force_error),
+    ):
+        if error is not None and not error - a.reference_error <= most:
+            yield f"error of {what} {brief(error)} > {brief(most)} in the energy norm"
+
+
+def _contradiction(a: Answer, r: Record) -> str:
+    """Describe an error that exceeds the bound certified in the run, or return "".
+
+    Certified bounds above 1 % are not examined.
+    """
+    if a.error is None or r.energy_bound is None or r.energy_bound > 0.01:
+        return ""
+    least = a.error - (a.reference_error or 0.0)
+    if least <= 1.01 * r.energy_bound + 1e-15:
+        return ""
+    return f"error {brief(least)}, certified at most {brief(r.energy_bound)}"
+
+
+def _over(value: float, scale: float) -> float:
+    """Divide with 0/0 = 0; the result is inf instead of NaN after an overflow."""
+    if value == 0:
+        return 0.0
+    ratio = value / scale if scale else np.inf
+    return float(np.inf if np.isnan(ratio) else ratio)
 
 
 def brief(value: float) -> str:

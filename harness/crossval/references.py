@@ -12,13 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mortarbench.harness.mechanics import Extended, Mechanics, Real
 from mortarbench.harness.plugin import Reference
 from mortarbench.harness.qp import QP, no_rows
 from mortarbench.harness.verify.active_set_refinement import (
-    CLOSED,
     ActiveSet,
     States,
     exchanged,
@@ -44,11 +42,6 @@ class ReferencePoint:
     states: States  #: (m,) states of the rows: closed, or multiplier at a bound
     norm: float  #: ‖u‖_K
     bound: float  #: certified bound on the relative error; see `Certificate.bound`
-
-    @property
-    def active(self) -> NDArray[np.bool_]:
-        """Mask (m,) of the closed rows."""
-        return np.asarray(self.states == CLOSED)
 
 
 def reference_point(mechanics: Mechanics, solve: Reference) -> ReferencePoint:

@@ -2,30 +2,30 @@
 
 No quantity that the run computed from the answers is used as evidence. Cases are
 rebuilt, and residuals, errors and distances are computed from the stored points.
-Answers that cannot be assessed are listed with the reason.
+Answers that cannot be judged are listed with the reason.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from time import monotonic
-from typing import NamedTuple
 
 from mortarbench.harness.crossval.comparison import (
-    Problem,
+    Answer,
+    Compared,
+    Outcome,
+    StoredAnswer,
+    answer_of,
     brief,
     compare_answers,
 )
-from mortarbench.harness.crossval.ground_truth import StoredAnswer
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import (
     digest_of,
-    is_stored,
     load_solution,
     point_arrays,
 )
@@ -43,39 +43,14 @@ MAX_SOLUTION_ERROR = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Listed:
-    """A measurement with a remark."""
-
-    run_id: str  #: `Record.identity`
-    solver: str
-    case: str
-    tol: float
-    text: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class Validation:
     """Result of a cross-validation."""
 
-    problems: tuple[Problem, ...]
-    solvers: tuple[str, ...]  #: labels of all solvers with a record
-    #: false claims without a point, which are not in `problems`
-    false_claims: tuple[Listed, ...]
-    #: measurements that ended without a claim of success, such as crashes and limits;
-    #: without declined QPs, verified points, proven claims of infeasibility, and
-    #: `false_claims`
-    unanswered: tuple[Listed, ...]
-    #: stored points and claims of infeasibility that could not be assessed
-    not_validated: tuple[Listed, ...]
+    #: every distinct answer, and every measurement without an answer
+    answers: tuple[Answer, ...]
+    #: largest distance between primal and dual answers, see `Compared.primal_dual`
+    primal_dual: Mapping[tuple[str, float], float]
     declined: int  #: number of measurements that the solver declined
-    proven: int = 0  #: number of claims of infeasibility that a certificate proves
-
-    @property
-    def agreed(self) -> bool:
-        """True if no claim is refuted and no certificate contradicts a reference."""
-        return not self.false_claims and not any(
-            a.refuted or a.contradiction for p in self.problems for a in p.answers
-        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,15 +62,6 @@ class _Folder:
     reference: Reference
 
 
-class _Part(NamedTuple):
-    """Result of the cross-validation of one physical case, in all its forms."""
-
-    problems: list[Problem]
-    lost: list[Listed]  #: points and claims of infeasibility that were not assessed
-    false: list[Listed]  #: false claims without a point
-    proven: int  #: number of proven claims of infeasibility
-
-
 def validate_folder(
     path: Path,
     families: Mapping[str, Family],
@@ -103,7 +69,7 @@ def validate_folder(
     tell: Callable[[str], None],
     budget: float = inf,
 ) -> Validation:
-    """Assess all answers of a result folder.
+    """Judge all answers of a result folder.
 
     reference : function that solves a QP accurately, independent of the solvers under
         test
@@ -114,40 +80,33 @@ def validate_folder(
     Raises
     ------
     InputError
-        If the folder or its journal is missing, or if the folder contains neither a
-        stored point nor a proven claim of infeasibility.
+        If the folder or its journal is missing, or if no answer can be judged.
 
     """
     records = [_apart(r) for r in read_journal(path)]
-    if not any(
-        (r.vectors and is_stored(path, r.vectors)) or _is_proven(r) for r in records
-    ):
-        raise InputError(f"{path}: {_pointless(records)}")
     folder = _Folder(path=path, families=families, reference=reference)
-    parts: list[_Part] = []
+    answers: list[Answer] = []
+    primal_dual: dict[tuple[str, float], float] = {}
     groups, begun = _groups(records), monotonic()
     for number, (name, group) in enumerate(groups.items(), 1):
-        if parts and monotonic() - begun > budget:
-            text = f"not begun within the budget of {budget:g} s"
-            parts.append(_Part([], [_listed(r, text) for r in group], [], 0))
+        if answers and monotonic() - begun > budget:
+            late = f"not begun within the budget of {budget:g} s"
+            answers += [answer_of(r, Outcome.NOT_VALIDATED, late) for r in group]
             continue
         tell(f"{name} ({number} of {len(groups)})")
-        parts.append(_group(folder, name, group))
-    false_claims = [claim for part in parts for claim in part.false]
+        problems, others = _group(folder, group)
+        for problem in problems:
+            answers += problem.answers
+            for key, value in problem.primal_dual.items():
+                primal_dual[key] = max(value, primal_dual.get(key, 0.0))
+        answers += others
+    if all(a.outcome in (Outcome.UNANSWERED, Outcome.NOT_VALIDATED) for a in answers):
+        why = answers[0].text if answers else "all solvers decline"
+        raise InputError(f"{path}: no stored answer can be judged: {why}")
     return Validation(
-        problems=tuple(p for part in parts for p in part.problems),
-        solvers=tuple(sorted({r.solver for r in records})),
-        false_claims=tuple(false_claims),
-        unanswered=tuple(
-            _listed(r, ": ".join(filter(None, (r.verdict.words, r.message))))
-            for r in records
-            if r.claimed != Status.SOLVED
-            and not (r.verdict.is_verified or r.verdict is Verdict.DECLINED)
-            and r.identity not in {x.run_id for x in false_claims}
-        ),
-        not_validated=tuple(x for part in parts for x in part.lost),
+        answers=tuple(answers),
+        primal_dual=primal_dual,
         declined=sum(r.verdict is Verdict.DECLINED for r in records),
-        proven=sum(part.proven for part in parts),
     )
 
 
@@ -160,142 +119,126 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
     return groups
 
 
-def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
-    """Assess the answers to one physical case, and claims of its infeasibility."""
-    cases, records, lost = _built(folder, records)
-    answers, damaged = _stored_answers(folder, records, cases)
-    lost += damaged
-    claims = list(filter(_is_proven, records))
-    contradictory = set()
-    # the run did not store the certificate of the solver: search for a new one
-    for r in claims:
+def _group(
+    folder: _Folder, records: Sequence[Record]
+) -> tuple[list[Compared], list[Answer]]:
+    """Judge the answers to one physical case in all its forms.
+
+    Returns the compared answers of each problem, and the measurements without a point.
+    Forms with equal mechanics are one problem. Without mechanics, each form is one.
+    """
+    cases, lost = _built(folder, records)
+    unreadable = {a.run_id for a in lost}
+    records = [r for r in records if r.identity not in unreadable]
+    stored: dict[tuple[str, str, float, str], StoredAnswer] = {}
+    by_problem: dict[str, list[StoredAnswer]] = {}
+    pointless = []
+    for r in records:
+        key = (r.solver, r.case, r.tol, r.vectors or "")
+        if key in stored:  # the same point of an earlier repeat
+            continue
+        if not r.vectors or not (
+            r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
+        ):
+            pointless.append(r)
+            continue
+        case = cases[r.case]
+        try:
+            stored[key] = _stored_answer(folder.path, r, case)
+        except InputError as e:
+            lost.append(answer_of(r, Outcome.NOT_VALIDATED, str(e)))
+            continue
+        of = case.mechanics
+        problem = r.case if of is None else qp_digest(of.program)
+        by_problem.setdefault(problem, []).append(stored[key])
+    compared = [compare_answers(g, folder.reference) for g in by_problem.values()]
+    solved: dict[str, float] = {}  # error bounds of the references by case
+    for problem, each in zip(by_problem, compared, strict=True):
+        bound = each.reference_error
+        if bound is not None and bound < MAX_SOLUTION_ERROR:
+            # a solution of the elastic problem refutes claims in every form
+            names = [problem] if problem in cases else [r.case for r in records]
+            solved |= dict.fromkeys(names, bound)
+    lost += [_without_point(r, cases, solved.get(r.case)) for r in pointless]
+    return compared, lost
+
+
+def _without_point(
+    r: Record, cases: Mapping[str, Case], solved: float | None
+) -> Answer:
+    """Judge a measurement without a point.
+
+    solved : error bound of a solution of the problem, if it has one
+    """
+    if r.claimed == Status.SOLVED:
+        text = "claims success without a finite point"
+        return answer_of(r, Outcome.REFUTED, text)
+    if _is_proven(r):
+        # the run did not store the certificate of the solver: search for a new one
         qp = cases[r.case].qp
         claim = Solution.without_point(qp, Status(r.claimed or "infeasible"))
-        if certificate_of(qp, claim, r.judged_at)[0]:
-            contradictory.add(r.identity)
-    lost += [
-        _listed(r, "the certificate could not be computed again")
-        for r in claims
-        if r.identity not in contradictory
-    ]
-    # forms with equal mechanics belong to one problem; without mechanics, each form is
-    # a separate problem
-    by_numbers: dict[str, list[StoredAnswer]] = {}
-    for g in answers:
-        of = g.case.mechanics
-        key = g.record.case if of is None else qp_digest(of.program)
-        by_numbers.setdefault(key, []).append(g)
-    problems: list[Problem] = []
-    for same in by_numbers.values():
-        forms = ", ".join(dict.fromkeys(g.record.form for g in same))
-        called = name if len(by_numbers) == 1 else f"{name} ({forms})"
-        problems.append(compare_answers(called, same, folder.reference))
-    proven = [
-        p for p in problems if p.doubt is not None and p.doubt < MAX_SOLUTION_ERROR
-    ]
-    solvable = {a.case: p for p in proven for a in p.answers}
-    # a solution of the elastic problem refutes claims in every form
-    elastic = next((p for p in proven if p.closed is not None), None)
-    false = [
-        _listed(r, text)
-        for r in records
-        if r.identity not in contradictory
-        and (text := _falsehood(r, solvable.get(r.case, elastic)))
-    ]
-    return _Part(problems, lost, false, len(contradictory))
-
-
-def _pointless(records: Sequence[Record]) -> str:
-    """Return the reason why a folder has no answers that could be assessed."""
-    if any(r.vectors for r in records):
-        return "its stored points are missing; expected the vectors/*.npz of the run"
-    statuses = Counter(r.verdict.words for r in records)
-    ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
-    return f"no solver returned a point ({ends}); expected a solver that solves a case"
+        holds, why = certificate_of(qp, claim, r.judged_at)
+        if holds:
+            return answer_of(r, Outcome.PROVEN, why)
+    if r.claimed in NO_SOLUTION and solved is not None:
+        text = (
+            "claims that there is no solution; the reference is one, with an error of "
+            f"at most {brief(solved)}"
+        )
+        return answer_of(r, Outcome.REFUTED, text)
+    if _is_proven(r):
+        text = "the certificate could not be computed again"
+        return answer_of(r, Outcome.NOT_VALIDATED, text)
+    text = ": ".join(filter(None, (r.verdict.words, r.message)))
+    return answer_of(r, Outcome.UNANSWERED, text)
 
 
 def _built(
     folder: _Folder, records: Iterable[Record]
-) -> tuple[dict[str, Case], list[Record], list[Listed]]:
-    """Rebuild the cases of answers.
+) -> tuple[dict[str, Case], list[Answer]]:
+    """Rebuild the cases of the answers.
 
-    Returns
-    -------
-    the cases by name, the records that can be assessed, and the others with the reason:
-    the case of an answer cannot be rebuilt, or the QP of the record is another one
-
+    Returns the cases by name, and the answers that cannot be judged: their case cannot
+    be rebuilt, or their QP is another one.
     """
     cases: dict[str, Case] = {}
-    same: list[Record] = []
-    lost: list[Listed] = []
-    by_case: dict[str, list[Record]] = {}
+    digests: dict[str, str] = {}
+    faults: dict[str, str] = {}
+    lost = []
     for r in records:
-        by_case.setdefault(r.case, []).append(r)
-    for name, mine in by_case.items():
-        answered = [r for r in mine if r.vectors or _is_proven(r)]
-        known: tuple[str | None, ...] = ()
-        try:
-            if answered:
-                cases[name] = rebuild(
-                    answered[0], folder.path, folder.families, folder.reference
-                )
-                built = cases[name]
-                now = built.digest or qp_digest(built.qp, serialised=True)
-                known = None, now
-        except InputError as e:
-            lost += [_listed(r, str(e)) for r in answered]
-            mine = [r for r in mine if not (r.vectors or _is_proven(r))]
-        for r in mine:
-            if not known or r.qp in known:
-                same.append(r)
+        if not (r.vectors or _is_proven(r)):
+            continue
+        if r.case not in cases and r.case not in faults:
+            try:
+                case = rebuild(r, folder.path, folder.families, folder.reference)
+            except InputError as e:
+                faults[r.case] = str(e)
             else:
-                text = (
-                    f"its QP has the digest {known[1]} now, {r.qp} when it was "
-                    "measured; expected the same version of the code, of its libraries "
-                    "and of plug-ins"
-                )
-                lost.append(_listed(r, text))
-    return cases, same, lost
+                cases[r.case] = case
+                digests[r.case] = case.digest or qp_digest(case.qp, serialised=True)
+        fault = faults.get(r.case)
+        if fault is None and r.qp not in (None, now := digests[r.case]):
+            fault = (
+                f"its QP has the digest {now} now, {r.qp} when it was measured; "
+                "expected the same version of the code, of its libraries and of "
+                "plug-ins"
+            )
+        if fault is not None:
+            lost.append(answer_of(r, Outcome.NOT_VALIDATED, fault))
+    return cases, lost
 
 
-def _stored_answers(
-    folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
-) -> tuple[list[StoredAnswer], list[Listed]]:
-    """Read the stored points of claims of success, and other verified points.
-
-    Equal points of a solver for the same case and tolerance are read once. The second
-    result lists the points that cannot be read, with the reasons.
-    """
-    answers: dict[tuple[str, str, float, str], StoredAnswer] = {}
-    lost: list[Listed] = []
-    for r in records:
-        if not r.vectors or not (
-            r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
-        ):
-            continue
-        key = (r.solver, r.case, r.tol, r.vectors)
-        if key in answers:
-            repeats = answers[key].repeats + 1
-            answers[key] = replace(answers[key], repeats=repeats)
-            continue
-        case = cases[r.case]
-        try:
-            s = load_solution(folder.path, r.vectors, Status(r.claimed or "failed"))
-            if (wrong := s.mismatch(case.qp)) or not has_point(s):
-                file = folder.path / "vectors" / f"{r.vectors}.npz"
-                raise InputError(f"{file}: {wrong or 'NaN or inf'}")
-        except InputError as e:
-            lost.append(_listed(r, str(e)))
-            continue
-        answers[key] = StoredAnswer(
-            record=r,
-            label=r.solver,
-            repeats=1,
-            case=case,
-            solution=s,
-            remarks=() if digest_of(point_arrays(s)) == r.vectors else (_CHANGED,),
-        )
-    return list(answers.values()), lost
+def _stored_answer(path: Path, r: Record, case: Case) -> StoredAnswer:
+    """Read the stored point of a record; raise InputError if it is unusable."""
+    assert r.vectors is not None
+    s = load_solution(path, r.vectors, Status(r.claimed or "failed"))
+    if (wrong := s.mismatch(case.qp)) or not has_point(s):
+        file = path / "vectors" / f"{r.vectors}.npz"
+        raise InputError(f"{file}: {wrong or 'NaN or inf'}")
+    changed = digest_of(point_arrays(s)) != r.vectors
+    return StoredAnswer(
+        record=r, case=case, solution=s, remark=_CHANGED if changed else ""
+    )
 
 
 def _is_proven(r: Record) -> bool:
@@ -303,27 +246,6 @@ def _is_proven(r: Record) -> bool:
     return r.verdict.is_verified and r.verdict is not Verdict.VERIFIED
 
 
-def _falsehood(r: Record, solved: Problem | None) -> str:
-    """Return the reason why the claim of a record is false, or "".
-
-    Only claims of success without a point, and claims of infeasibility, are considered.
-
-    solved : the problem if it has a reference point, else None
-    """
-    if r.claimed == Status.SOLVED and not r.vectors:
-        return "claims success without a finite point"
-    if r.claimed in NO_SOLUTION and solved is not None:
-        return (
-            f"claims that there is no solution; the {solved.truth} is one, with an "
-            f"error of at most {brief(solved.doubt or 0.0)}"
-        )
-    return ""
-
-
 def _apart(r: Record) -> Record:
     """Return the record; for a step of a sequence, the label includes the mode."""
     return r if r.mode == "cold" else r.replace(solver=f"{r.solver} ({r.mode})")
-
-
-def _listed(r: Record, text: str) -> Listed:
-    return Listed(run_id=r.identity, solver=r.solver, case=r.case, tol=r.tol, text=text)

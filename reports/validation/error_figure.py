@@ -33,10 +33,16 @@ Answer = Mapping[str, Any]
 _DOT = Look(colour=COLOURS[0], marker="o", dash=None, size=3.6, edge=0.6)
 _RING = Look(colour=COLOURS[0], marker="o", dash=None, size=3.6, edge=0.6, fill="none")
 _CROSS = Look(colour=COLOURS[1], marker="X", dash=None, size=5.8, edge=0.6)
+
+
+def _refuted(a: Answer) -> bool:
+    return bool(a["outcome"] == "refuted")
+
+
 _KINDS: tuple[tuple[str, Callable[[Answer], bool], Look], ...] = (
-    ("primal form", lambda a: not a["refuted"] and a["form"] == "primal", _RING),
-    ("dual or other form", lambda a: not a["refuted"] and a["form"] != "primal", _DOT),
-    ("refuted", lambda a: bool(a["refuted"]), _CROSS),
+    ("primal form", lambda a: not _refuted(a) and a["form"] == "primal", _RING),
+    ("dual or other form", lambda a: not _refuted(a) and a["form"] != "primal", _DOT),
+    ("refuted", _refuted, _CROSS),
 )
 
 
@@ -45,7 +51,7 @@ def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
 
     answers : answers in the data returned by `validate`
     """
-    known = [a for a in answers if a["tol"] == tol and a["error"] is not None]
+    known = [a for a in answers if a["tol"] == tol and a["bound"] is not None]
     if not known:
         return None
     solvers = sorted({a["solver"] for a in known})
@@ -58,7 +64,7 @@ def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
             mine = [a for a in chosen if a["solver"] == solver]
             marks.append(
                 Series(
-                    x=tuple(max(a["error"], _FLOOR) for a in mine),
+                    x=tuple(max(a["bound"], _FLOOR) for a in mine),
                     y=tuple(_shift(known, a) - solvers.index(solver) for a in mine),
                     runs=tuple((a["run_id"],) for a in mine),
                     look=look,
@@ -69,7 +75,7 @@ def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
     rules, texts = [], []
     for at, text in (
         (tol, f"t = {tolerance(tol)}"),
-        (known[0]["energy_allowed"], "√(20t), largest allowed"),
+        (min(np.sqrt(20 * tol), np.sqrt(0.2)), "√(20t), largest allowed"),
     ):
         rules.append(Rule(axis="x", at=at, look=_LIMIT))
         texts.append(

@@ -222,14 +222,14 @@ def test_ratios_name_the_measurements_after():
 
 def test_every_certified_error_names_its_answer():
     answers = [
-        {"solver": s, "form": "primal", "refuted": False, "tol": 1e-6, "error": e,
-         "run_id": f"{s}{e}", "energy_allowed": 1e-2}
+        {"solver": s, "form": "primal", "outcome": "agrees", "tol": 1e-6,
+         "bound": e, "run_id": f"{s}{e}"}
         for s in "ba" for e in (1e-8, 1e-7)
     ]  # fmt: skip
     figure = error_figure(answers, 1e-6)
     points = {(solver, x): runs for (solver, x, _), runs in told(figure).items()}
 
-    assert points == {(a["solver"], a["error"]): (a["run_id"],) for a in answers}
+    assert points == {(a["solver"], a["bound"]): (a["run_id"],) for a in answers}
     (panel,) = figure.panels
     rows = {one.solver: one.y for one in series(figure)}
     names = {name: at for at, name in panel.y.ticks}
