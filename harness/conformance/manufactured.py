@@ -219,7 +219,15 @@ def strings(form: str) -> QP:
         = Rᵀf,  λ_I ≥ 0,  where λ_I are the multipliers of G. "dual-bounds" is the dual
         after elimination of the fixed ends; its only constraint is λ ≥ 0
     """
-    K, f, R = _two_strings()
+    K, R = np.zeros((42, 42)), np.zeros((42, 2))
+    for body, (tension, cells, nodes) in enumerate(
+        [(2.0, 24, slice(0, 25)), (0.5, 16, slice(25, 42))]
+    ):
+        stretch = np.diff(np.eye(cells + 1), axis=0)
+        K[nodes, nodes] = tension * cells * stretch.T @ stretch
+        R[nodes, body] = 1 / np.sqrt(cells + 1)
+    f = np.zeros(42)
+    f[1:24] = -1 / 24  # the load acts on the upper string only
     upper, lower = np.arange(1, 24), np.linspace(0, 1, 17)
     at = upper / 24
     weights = [np.interp(at, lower, hat) for hat in np.eye(17)]
@@ -251,23 +259,6 @@ def strings(form: str) -> QP:
         ub=np.full(m, np.inf),
         structure=Structure(K=csc_array(K), B=csc_array(B), fixed=fixed),
     )
-
-
-def _two_strings() -> tuple[Vector, Vector, Vector]:
-    """Return stiffness K (42, 42), load (42,) and an orthonormal kernel of K (42, 2).
-
-    The load acts on the upper string only.
-    """
-    K, R = np.zeros((42, 42)), np.zeros((42, 2))
-    for body, (tension, cells, nodes) in enumerate(
-        [(2.0, 24, slice(0, 25)), (0.5, 16, slice(25, 42))]
-    ):
-        ends = np.diff(np.eye(cells + 1), axis=0)
-        K[nodes, nodes] = tension * cells * ends.T @ ends
-        R[nodes, body] = 1 / np.sqrt(cells + 1)
-    f = np.zeros(42)
-    f[1:24] = -1 / 24
-    return K, f, R
 
 
 def infeasible() -> QP:

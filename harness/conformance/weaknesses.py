@@ -12,33 +12,19 @@ from mortarbench.harness.conformance.conformance import (
 from mortarbench.harness.conformance.equivalence import (
     CHANGES,
     CHANGES_OF,
-    TOL,
     UNCHANGED,
 )
 
 MIN_LISTED_WORK_RATIO = 2.0  #: least ratio of iterations that the table shows
 
-HEAD = f"""\
+HEAD = """\
 # Effects of equivalent formulations
 
-**Does the answer of a solver change if the same QP is written in another way?** `make
-weaknesses` runs these tests and writes this page; `mortarbench test-solver NAME` runs
-them for one solver.
-
-The problem of two strings in contact (`harness.conformance.manufactured.strings`) is
-solved at tolerance {TOL:g} in three forms: the primal QP, its dual, and its dual with
-bounds only. It is then solved in equivalent formulations
-(`harness.conformance.equivalence`): in other units, in another order, with rows scaled
-by powers of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted or of the
-opposite sign. In exact arithmetic, neither verdict nor answer changes.
-
-The entries of the table have these meanings:
-
-- "·": verdict and answer do not change in any form that the solver solves;
-- ×k: in the worst form, the solver takes k times as many iterations (for k ≥ 2);
-- **form**: verdict or answer change in this form; see the section *Evidence*;
-- (form): the solver declines the changed QP of this form;
-- blank: the change does not apply to any form that the solver solves.
+**Does the answer of a solver change if the same QP is written in another way?**
+`harness.conformance.equivalence` describes the problem and the formulations. Entries:
+"·": neither verdict nor answer change; ×k: k times as many iterations in the worst form
+(k ≥ 2); **form**: verdict or answer change in this form; (form): the changed QP is
+declined; blank: the change applies to no form that the solver solves.
 
 """
 

@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -74,6 +73,9 @@ class Answer:
     error: float | None = None  #: ‖u − u*‖
     force_error: float | None = None  #: ‖u_λ − u*‖
     reference_error: float | None = None  #: bound on the error of the reference
+    #: largest distance ‖u − u'‖ from earlier answers u' of this solver, of which one is
+    #: to the primal form and the other to a dual form
+    primal_dual: float | None = None
 
     @property
     def bound(self) -> float | None:
@@ -94,18 +96,6 @@ class StoredAnswer:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Compared:
-    """The answers to one problem."""
-
-    answers: tuple[Answer, ...]
-    #: bound on the error of the reference; None without a reference
-    reference_error: float | None
-    #: largest distance ‖u − u'‖/‖u*‖ between primal and dual answers of one solver, by
-    #: solver and tolerance
-    primal_dual: dict[tuple[str, float], float]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class _Reference:
     """A reference solution, the norm of its problem, and the errors of answers."""
 
@@ -113,11 +103,17 @@ class _Reference:
     norm: Callable[[Any], float]  #: energy norm of a difference of displacements
     length: float  #: ‖u*‖
     #: returns u − u* and, with mechanics, u_λ − u* of an answer
-    errors: Callable[[StoredAnswer], tuple[Extended | Vector, Extended | None]]
+    deviations: Callable[[StoredAnswer], tuple[Extended | Vector, ...]]
+
+    def relative(self, v: Any) -> float:
+        """Return ‖v‖/‖u*‖ with 0/0 = 0; inf instead of NaN after an overflow."""
+        size = self.norm(v)
+        ratio = size / self.length if size and self.length else size and np.inf
+        return float(np.inf if np.isnan(ratio) else ratio)
 
 
-def answer_of(r: Record, outcome: Outcome, text: str) -> Answer:
-    """Return an answer without errors."""
+def answer_of(r: Record, outcome: Outcome, text: str, **errors: float | None) -> Answer:
+    """Return the answer of a measurement; its other fields are `errors`."""
     return Answer(
         run_id=r.identity,
         solver=r.solver,
@@ -127,6 +123,7 @@ def answer_of(r: Record, outcome: Outcome, text: str) -> Answer:
         claimed=r.claimed or "",
         outcome=outcome,
         text=text,
+        **errors,
     )
 
 
@@ -136,7 +133,7 @@ def energy_allowed(tol: float) -> float:
 
 
 @np.errstate(all="ignore")  # components of a point may be as large as 1e300
-def compare_answers(answers: Sequence[StoredAnswer], solve: Reference) -> Compared:
+def compare_answers(answers: Sequence[StoredAnswer], solve: Reference) -> list[Answer]:
     """Judge all answers to one problem.
 
     Without a reference, answers are judged by their residuals alone.
@@ -153,42 +150,33 @@ def compare_answers(answers: Sequence[StoredAnswer], solve: Reference) -> Compar
             reference = _elastic_reference(case.mechanics.whole, solve)
     except Exception as e:  # also raised by code of the family
         why = str(e) if isinstance(e, UnsolvedError) else note_of("reference", e)
-        return Compared(
-            answers=tuple(_judged(g, why) for g in answers),
-            reference_error=None,
-            primal_dual={},
-        )
-    judged, deviations = [], []
+        return [_judged(g, why) for g in answers]
+    judged: list[Answer] = []
+    deviations: list[tuple[Record, Any]] = []
     for g in answers:
         try:
-            off, force_off = reference.errors(g)
+            off, *force_off = reference.deviations(g)
         except Exception as e:  # raised by code of the family
             judged.append(_judged(g, note_of("distance", e)))
             continue
-        error, force_error = (
-            None if v is None else _over(reference.norm(v), reference.length)
-            for v in (off, force_off)
-        )
+        r = g.record
+        others = [
+            reference.relative(off - v)
+            for other, v in deviations
+            if (other.solver, other.tol) == (r.solver, r.tol)
+            and (other.form == "primal") != (r.form == "primal")
+        ]
+        deviations.append((r, off))
         judged.append(
             _judged(
                 g,
-                error=error,
-                force_error=force_error,
+                error=reference.relative(off),
+                force_error=reference.relative(force_off[0]) if force_off else None,
                 reference_error=reference.bound,
+                primal_dual=max(others, default=None),
             )
         )
-        deviations.append((judged[-1], off))
-    primal_dual: dict[tuple[str, float], float] = {}
-    for (a, u), (b, v) in combinations(deviations, 2):
-        key = a.solver, a.tol
-        if key == (b.solver, b.tol) and (a.form == "primal") != (b.form == "primal"):
-            distance = _over(reference.norm(u - v), reference.length)
-            primal_dual[key] = max(primal_dual.get(key, 0.0), distance)
-    return Compared(
-        answers=tuple(judged),
-        reference_error=reference.bound,
-        primal_dual=primal_dual,
-    )
+    return judged
 
 
 def _elastic_reference(mechanics: Mechanics, solve: Reference) -> _Reference:
@@ -199,7 +187,7 @@ def _elastic_reference(mechanics: Mechanics, solve: Reference) -> _Reference:
     """
     point, exact = reference_point(mechanics, solve), mechanics.exact
 
-    def errors(g: StoredAnswer) -> tuple[Extended, Extended]:
+    def deviations(g: StoredAnswer) -> tuple[Extended, Extended]:
         assert g.case.mechanics is not None
         s = g.case.mechanics.to_primal(g.solution)
         force = exact.f - exact.B.T @ mechanics.multipliers(s).astype(Real)
@@ -210,7 +198,7 @@ def _elastic_reference(mechanics: Mechanics, solve: Reference) -> _Reference:
         bound=point.bound,
         norm=mechanics.norm,
         length=point.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0]),
-        errors=errors,
+        deviations=deviations,
     )
 
 
@@ -230,31 +218,19 @@ def _plain_reference(qp: QP, solve: Reference) -> _Reference:
         bound=float(np.sqrt(2 * worst)),
         norm=lambda v: float(np.sqrt(max(v @ (qp.P @ v), 0.0))),
         length=float(np.sqrt(max(truth.x @ (qp.P @ truth.x), abs(qp.q @ truth.x)))),
-        errors=lambda g: (g.solution.x - truth.x, None),
+        deviations=lambda g: (g.solution.x - truth.x,),
     )
 
 
-def _judged(
-    g: StoredAnswer,
-    unassessed: str = "",
-    *,
-    error: float | None = None,
-    force_error: float | None = None,
-    reference_error: float | None = None,
-) -> Answer:
+def _judged(g: StoredAnswer, unassessed: str = "", **errors: float | None) -> Answer:
     """Return an answer with its outcome.
 
     unassessed : reason why the errors are unknown
+    errors : fields of the answer
     """
     r = g.record
     residuals = kkt_residuals(g.case.qp, g.solution)
-    answer = replace(
-        answer_of(r, Outcome.AGREES, ""),
-        residual=residuals.worst,
-        error=error,
-        force_error=force_error,
-        reference_error=reference_error,
-    )
+    answer = answer_of(r, Outcome.AGREES, "", residual=residuals.worst, **errors)
     now = verdict(g.solution.status, residuals, answer.tol)
     reasons = list(_refutations(answer)) if r.claimed == Status.SOLVED else []
     if reasons:
@@ -297,14 +273,6 @@ def _contradiction(a: Answer, r: Record) -> str:
     if least <= 1.01 * r.energy_bound + 1e-15:
         return ""
     return f"error {brief(least)}, certified at most {brief(r.energy_bound)}"
-
-
-def _over(value: float, scale: float) -> float:
-    """Divide with 0/0 = 0; the result is inf instead of NaN after an overflow."""
-    if value == 0:
-        return 0.0
-    ratio = value / scale if scale else np.inf
-    return float(np.inf if np.isnan(ratio) else ratio)
 
 
 def brief(value: float) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
 from mortarbench.harness.crossval.comparison import Answer, Outcome
-from mortarbench.harness.crossval.validation import Validation
 from mortarbench.harness.errors import some
 from mortarbench.harness.record import finite
 from mortarbench.harness.verify.verdicts import plain
@@ -34,18 +34,16 @@ class Row:
     primal_dual: float | None  #: largest distance between primal and dual answers
 
 
-def as_data(validation: Validation, folder: str) -> dict[str, Any]:
+def as_data(answers: Sequence[Answer], folder: str) -> dict[str, Any]:
     """Return the summary of a cross-validation, followed by all answers.
 
     folder : name of the result folder
     """
-    answers = validation.answers
     points = [a for a in answers if a.residual is not None]
     counts = {
         "answers": len(points),
         "solvers": len({a.solver for a in points}),
         "cases": len({a.case for a in points}),
-        "declined": validation.declined,
         **{o.name.lower(): sum(a.outcome is o for a in answers) for o in Outcome},
     }
     agreed = not any(a.outcome in _WRONG for a in answers)
@@ -56,15 +54,16 @@ def as_data(validation: Validation, folder: str) -> dict[str, Any]:
         "agreed": agreed,
         "headline": _headline(agreed, counts, answers),
         "counts": counts,
-        "solvers": [asdict(_row(validation, solver, -tol)) for tol, solver in keys],
+        "solvers": [asdict(_row(answers, solver, -tol)) for tol, solver in keys],
         "answers": [asdict(a) | {"bound": a.bound} for a in answers],
     }
     return dict(finite(plain(data)))
 
 
-def _row(validation: Validation, solver: str, tol: float) -> Row:
-    mine = [a for a in validation.answers if (a.solver, a.tol) == (solver, tol)]
+def _row(answers: Sequence[Answer], solver: str, tol: float) -> Row:
+    mine = [a for a in answers if (a.solver, a.tol) == (solver, tol)]
     errors = [(bound, a.case) for a in mine if (bound := a.bound) is not None]
+    distances = [a.primal_dual for a in mine if a.primal_dual is not None]
     worst, worst_case = max(errors, default=(None, ""))
     return Row(
         solver=solver,
@@ -75,11 +74,11 @@ def _row(validation: Validation, solver: str, tol: float) -> Row:
         error_median=median(e for e, _ in errors) if errors else None,
         error_worst=worst,
         worst_case=worst_case,
-        primal_dual=validation.primal_dual.get((solver, tol)),
+        primal_dual=max(distances, default=None),
     )
 
 
-def _headline(agreed: bool, counts: dict[str, int], answers: tuple[Answer, ...]) -> str:
+def _headline(agreed: bool, counts: dict[str, int], answers: Sequence[Answer]) -> str:
     """Return the result of the cross-validation as one or two sentences."""
     what = ", ".join(
         [

@@ -8,14 +8,13 @@ Answers that cannot be judged are listed with the reason.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from math import inf
 from pathlib import Path
 from time import monotonic
 
 from mortarbench.harness.crossval.comparison import (
     Answer,
-    Compared,
     Outcome,
     StoredAnswer,
     answer_of,
@@ -40,26 +39,7 @@ from mortarbench.harness.verify.verdicts import has_point
 _CHANGED = "the file of the stored point was changed after the measurement"
 #: Largest error bound of a reference point that refutes a claim of infeasibility.
 MAX_SOLUTION_ERROR = 1e-2
-
-
-@dataclass(frozen=True, kw_only=True)
-class Validation:
-    """Result of a cross-validation."""
-
-    #: every distinct answer, and every measurement without an answer
-    answers: tuple[Answer, ...]
-    #: largest distance between primal and dual answers, see `Compared.primal_dual`
-    primal_dual: Mapping[tuple[str, float], float]
-    declined: int  #: number of measurements that the solver declined
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Folder:
-    """A result folder, with the families and reference solve for its validation."""
-
-    path: Path
-    families: Mapping[str, Family]
-    reference: Reference
+Build = Callable[[Record], Case]  #: builds the case of a record again
 
 
 def validate_folder(
@@ -68,8 +48,10 @@ def validate_folder(
     reference: Reference,
     tell: Callable[[str], None],
     budget: float = inf,
-) -> Validation:
-    """Judge all answers of a result folder.
+) -> list[Answer]:
+    """Judge all distinct answers of a result folder, and measurements without one.
+
+    Declined QPs are omitted.
 
     reference : function that solves a QP accurately, independent of the solvers under
         test
@@ -83,31 +65,20 @@ def validate_folder(
         If the folder or its journal is missing, or if no answer can be judged.
 
     """
-    records = [_apart(r) for r in read_journal(path)]
-    folder = _Folder(path=path, families=families, reference=reference)
+    build = partial(rebuild, folder=path, families=families, reference=reference)
     answers: list[Answer] = []
-    primal_dual: dict[tuple[str, float], float] = {}
-    groups, begun = _groups(records), monotonic()
+    groups, begun = _groups(map(_apart, read_journal(path))), monotonic()
     for number, (name, group) in enumerate(groups.items(), 1):
         if answers and monotonic() - begun > budget:
             late = f"not begun within the budget of {budget:g} s"
             answers += [answer_of(r, Outcome.NOT_VALIDATED, late) for r in group]
             continue
         tell(f"{name} ({number} of {len(groups)})")
-        problems, others = _group(folder, group)
-        for problem in problems:
-            answers += problem.answers
-            for key, value in problem.primal_dual.items():
-                primal_dual[key] = max(value, primal_dual.get(key, 0.0))
-        answers += others
+        answers += _group(path, group, build, reference)
     if all(a.outcome in (Outcome.UNANSWERED, Outcome.NOT_VALIDATED) for a in answers):
         why = answers[0].text if answers else "all solvers decline"
         raise InputError(f"{path}: no stored answer can be judged: {why}")
-    return Validation(
-        answers=tuple(answers),
-        primal_dual=primal_dual,
-        declined=sum(r.verdict is Verdict.DECLINED for r in records),
-    )
+    return answers
 
 
 def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
@@ -120,55 +91,55 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
 
 
 def _group(
-    folder: _Folder, records: Sequence[Record]
-) -> tuple[list[Compared], list[Answer]]:
+    path: Path, records: Sequence[Record], build: Build, reference: Reference
+) -> list[Answer]:
     """Judge the answers to one physical case in all its forms.
 
-    Returns the compared answers of each problem, and the measurements without a point.
     Forms with equal mechanics are one problem. Without mechanics, each form is one.
     """
-    cases, lost = _built(folder, records)
-    unreadable = {a.run_id for a in lost}
-    records = [r for r in records if r.identity not in unreadable]
-    stored: dict[tuple[str, str, float, str], StoredAnswer] = {}
+    cases, judged = _built(records, build)
+    lost = {a.run_id for a in judged}
+    seen: set[tuple[str, str, float, str]] = set()
     by_problem: dict[str, list[StoredAnswer]] = {}
     pointless = []
     for r in records:
-        key = (r.solver, r.case, r.tol, r.vectors or "")
-        if key in stored:  # the same point of an earlier repeat
+        if r.identity in lost:
             continue
         if not r.vectors or not (
             r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
         ):
             pointless.append(r)
             continue
+        key = (r.solver, r.case, r.tol, r.vectors)
+        if key in seen:  # the point of an earlier repeat
+            continue
+        seen.add(key)
         case = cases[r.case]
         try:
-            stored[key] = _stored_answer(folder.path, r, case)
+            g = _stored_answer(path, r, case)
         except InputError as e:
-            lost.append(answer_of(r, Outcome.NOT_VALIDATED, str(e)))
+            judged.append(answer_of(r, Outcome.NOT_VALIDATED, str(e)))
             continue
-        of = case.mechanics
-        problem = r.case if of is None else qp_digest(of.program)
-        by_problem.setdefault(problem, []).append(stored[key])
-    compared = [compare_answers(g, folder.reference) for g in by_problem.values()]
+        elastic = case.mechanics
+        problem = r.case if elastic is None else qp_digest(elastic.program)
+        by_problem.setdefault(problem, []).append(g)
     solved: dict[str, float] = {}  # error bounds of the references by case
-    for problem, each in zip(by_problem, compared, strict=True):
-        bound = each.reference_error
-        if bound is not None and bound < MAX_SOLUTION_ERROR:
-            # a solution of the elastic problem refutes claims in every form
-            names = [problem] if problem in cases else [r.case for r in records]
-            solved |= dict.fromkeys(names, bound)
-    lost += [_without_point(r, cases, solved.get(r.case)) for r in pointless]
-    return compared, lost
+    for problem, answers in by_problem.items():
+        compared = compare_answers(answers, reference)
+        judged += compared
+        # a solution of the elastic problem refutes claims in every form
+        names = [problem] if problem in cases else [r.case for r in records]
+        bounds = [b for a in compared if (b := a.reference_error) is not None]
+        solved |= dict.fromkeys(names, min(bounds, default=inf))
+    return judged + [
+        _without_point(r, cases, solved.get(r.case, inf)) for r in pointless
+    ]
 
 
-def _without_point(
-    r: Record, cases: Mapping[str, Case], solved: float | None
-) -> Answer:
+def _without_point(r: Record, cases: Mapping[str, Case], solved: float) -> Answer:
     """Judge a measurement without a point.
 
-    solved : error bound of a solution of the problem, if it has one
+    solved : error bound of a solution of the problem; inf if there is none
     """
     if r.claimed == Status.SOLVED:
         text = "claims success without a finite point"
@@ -180,7 +151,7 @@ def _without_point(
         holds, why = certificate_of(qp, claim, r.judged_at)
         if holds:
             return answer_of(r, Outcome.PROVEN, why)
-    if r.claimed in NO_SOLUTION and solved is not None:
+    if r.claimed in NO_SOLUTION and solved < MAX_SOLUTION_ERROR:
         text = (
             "claims that there is no solution; the reference is one, with an error of "
             f"at most {brief(solved)}"
@@ -194,7 +165,7 @@ def _without_point(
 
 
 def _built(
-    folder: _Folder, records: Iterable[Record]
+    records: Iterable[Record], build: Build
 ) -> tuple[dict[str, Case], list[Answer]]:
     """Rebuild the cases of the answers.
 
@@ -210,7 +181,7 @@ def _built(
             continue
         if r.case not in cases and r.case not in faults:
             try:
-                case = rebuild(r, folder.path, folder.families, folder.reference)
+                case = build(r)
             except InputError as e:
                 faults[r.case] = str(e)
             else:

@@ -294,8 +294,8 @@ def test_different_multipliers_of_one_contact_force_agree(duplicate):
 
     found = compare_answers(answers, reference_solution)
 
-    assert all(a.force_error < 1e-15 for a in found.answers)
-    assert {a.outcome for a in found.answers} == {"agrees"}
+    assert all(a.force_error < 1e-15 for a in found)
+    assert {a.outcome for a in found} == {"agrees"}
 
 
 def finds_nothing(qp):
@@ -310,8 +310,8 @@ def test_without_a_reference_answers_are_judged_by_their_residuals(duplicate):
 
     found = compare_answers(answers, finds_nothing)
 
-    assert [a.outcome for a in found.answers] == ["not validated", "refuted"]
-    assert "it found nothing" in found.answers[0].text
+    assert [a.outcome for a in found] == ["not validated", "refuted"]
+    assert "it found nothing" in found[0].text
 
 
 @pytest.mark.parametrize("serialised", [True, False])
@@ -407,7 +407,7 @@ def test_claims_without_a_point_are_refuted_and_crashes_are_listed(
     assert (code, culprits(verdict)) == (1, {"denies", "empty"})
     (dies,) = listed(verdict, "unanswered")
     assert (dies["solver"], dies["text"]) == ("dies", "crashed: as it ended")
-    assert verdict["counts"]["declined"] == 1
+    assert not any(a["solver"] == "picky" for a in verdict["answers"])
 
 
 def test_an_unrefuted_claim_is_listed(tmp_path, cli):
@@ -445,8 +445,8 @@ def test_failing_mechanics_do_not_remove_the_residuals(duplicate):
 
     found = compare_answers(answers, reference_solution)
 
-    assert [a.outcome for a in found.answers] == ["not validated", "refuted"]
-    assert "no factor" in found.answers[0].text
+    assert [a.outcome for a in found] == ["not validated", "refuted"]
+    assert "no factor" in found[0].text
 
 
 def test_a_stored_point_that_was_changed_afterwards_is_noticed(truths, tmp_path, cli):
@@ -577,8 +577,8 @@ def test_a_failing_recovery_affects_only_that_answer(duplicate):
 
     found = compare_answers(answers, reference_solution)
 
-    assert [a.outcome for a in found.answers] == ["agrees", "not validated"]
-    assert "no way back" in found.answers[1].text
+    assert [a.outcome for a in found] == ["agrees", "not validated"]
+    assert "no way back" in found[1].text
 
 
 def test_the_norm_of_errors_is_stated(truths, tmp_path, cli):
