@@ -23,7 +23,8 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.pairs import paired_ratio
 from mortarbench.harness.running.run import run
-from mortarbench.harness.suite.suite import NULL_SUFFIX, Suite
+from mortarbench.harness.suite.solver_options import NULL_SUFFIX
+from mortarbench.harness.suite.suite import Suite
 from mortarbench.harness.verify.measure import SAMPLE_SECONDS, memory_mib
 
 PLUGIN = Path(__file__).parents[1] / "tests/support/adversaries.py"

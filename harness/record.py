@@ -157,9 +157,6 @@ class Record(Measurement):
     build_seconds: float | None = None
     #: part of `build_seconds` spent on the factorisation and the dual; dual forms only
     dualise_seconds: float | None = None
-    #: peak resident memory of the new process that built the case; measured only in
-    #: series of growing sizes
-    build_peak_mib: float | None = None
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`
     threads: int | None = None  #: largest thread count of any library in the worker
@@ -304,7 +301,6 @@ _NOT_NEGATIVE = (
     *MEASURED,
     "build_seconds",
     "dualise_seconds",
-    "build_peak_mib",
     "recover_seconds",
     "certify_seconds",
     "threads",

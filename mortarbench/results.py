@@ -19,7 +19,7 @@ from mortarbench.harness.environment.doctor import load_advice
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.errors import shown as given
-from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text
+from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, toml
 from mortarbench.harness.record import REFUTED, Record, Verdict
 from mortarbench.harness.registry import is_solver, resolve
 from mortarbench.harness.results.faults import in_words
@@ -31,8 +31,8 @@ from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.running.run import Missing
 from mortarbench.harness.running.run import run as run_suite
 from mortarbench.harness.suite.overrides import with_overrides
-from mortarbench.harness.suite.solver_options import options_as_texts
-from mortarbench.harness.suite.suite import load_suite, name_in, parse_suite, suite_text
+from mortarbench.harness.suite.solver_options import listed_options
+from mortarbench.harness.suite.suite import as_toml, parse_suite, suite_file
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import TURN, Plugins, Registries, load_registries
 from mortarbench.reporting import Report, report
@@ -353,24 +353,20 @@ def run(
     folder = None if out is None else checked.path("out", out)
     if not isinstance(dask, str | None):
         raise InputError(f"dask = {given(dask)}; expected the address of a scheduler")
-    if isinstance(suite, Mapping):
-        with located("suite"):
-            text = suite_text(suite)
-    else:
-        text = read_text(registries.suite_path(suite), "a TOML file", MAX_TOML_MIB)
-    folder = folder or Path("out") / name_in(text)
+    path = Path("suite") if isinstance(suite, Mapping) else registries.suite_path(suite)
+    if not isinstance(suite, Mapping):
+        text = read_text(path, "a TOML file", MAX_TOML_MIB)
+    with located(f"{path}"):
+        if isinstance(suite, Mapping):
+            text = as_toml(suite)
+        folder = folder or Path("out") / suite_file(toml(text)).name
     fresh = checked.flag("fresh", fresh)
     if folder.is_dir():
         # Check for links before copies are read: a link could point outside the folder.
         refuse_links(folder)
     families = registries.families_with_copies(None if fresh else folder)
-    known_solvers = registries.solvers
-    if isinstance(suite, Mapping):
-        loaded = parse_suite(text, "suite", Path(), families, known_solvers)
-    else:
-        loaded = load_suite(registries.suite_path(suite), families, known_solvers)
     asked = with_overrides(
-        loaded,
+        parse_suite(text, f"{path}", path.parent, families, registries.solvers),
         families,
         registries.solvers,
         solvers=checked.texts("solvers", solvers),
@@ -378,7 +374,7 @@ def run(
         repeats=repeats,
         time_limit=time_limit,
         memory_limit=memory_limit,
-        options=options_as_texts({} if options is None else options),
+        options=listed_options({} if options is None else options),
     )
     environment = registries.environment()
     with shown(progress) as display, ExitStack() as stack:

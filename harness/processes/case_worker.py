@@ -52,7 +52,6 @@ from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.processes.protocol import Events, answer_requests
 from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
-from mortarbench.harness.verify.measure import memory_mib, reset_peak
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
 
 MAX_STORED_BOUNDS = 10_000  #: largest number of points whose error bounds are cached
@@ -78,8 +77,7 @@ class CaseWorker:
     #: cases in memory by canonical name, least recently used first
     _cases: dict[str, Case] = field(default_factory=dict)
     _build_seconds: float = 0.0  # duration of the last build, s
-    _build_peak_mib: float | None = None  # peak memory during the last build, MiB
-    _warm: bool = False  # True once a dual case, or a case "first", has been built
+    _warm: bool = False  # True once a dual case has been built
     #: error bounds and note (see `certified`) by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
         default_factory=dict
@@ -92,11 +90,6 @@ class CaseWorker:
         fields = request.get("build") or request["describe"]
         name = CaseId(**{**fields, "family": self.families[fields["family"]]})
         try:
-            if "first" in request:
-                first = request["first"]
-                family = self.families[first["family"]]
-                self._build(CaseId(**{**first, "family": family}))
-                self._warm = True
             case = self._case(name, request["keep"])
         except (Exception, SystemExit) as e:  # raised by code of the family
             return {
@@ -173,11 +166,9 @@ class CaseWorker:
         return case
 
     def _build(self, name: CaseId) -> Case:
-        has_peak = reset_peak()
         start = perf_counter()
         case = name.build(self.reference)
         self._build_seconds = perf_counter() - start
-        self._build_peak_mib = memory_mib("VmHWM") if has_peak else None
         return case
 
     def _write(self, case: Case, name: CaseId, path: Path) -> dict[str, Any]:
@@ -191,7 +182,6 @@ class CaseWorker:
         seconds = {
             "build_seconds": self._build_seconds,
             "dualise_seconds": case.dualise_seconds,
-            "build_peak_mib": self._build_peak_mib,
         }
         return {"meta": {**meta, **seconds, "qp": digest}}
 

@@ -156,8 +156,6 @@ class _SolverHost:
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
         limit, ranks, solver = request.get("memory_limit"), self.ranks, self._solver
         if ranks is not None:
-            if "first" in request:
-                ranks.build(request["first"])
             events.reached("built", ranks.build(request["case"]))
             qp, solver = ranks.qp, ranks.solver(solver)
         else:

@@ -23,15 +23,13 @@ from mortarbench.harness.files.durable import (
     report_full_disk,
 )
 from mortarbench.harness.files.reading import (
-    MAX_TOML_MIB,
     opened,
     read_json,
-    read_text,
     toml,
 )
 from mortarbench.harness.results.faults import FAULTS
 from mortarbench.harness.suite.growth import incompatibility
-from mortarbench.harness.suite.suite import Suite, read_stored
+from mortarbench.harness.suite.suite import Suite, SuiteFile, read_stored, suite_file
 
 #: Folders and files that commands write to a result folder. ``--fresh`` deletes or
 #: overwrites only these, those in `_RESULT_FILES`, and copies of input files.
@@ -351,11 +349,11 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
         states the difference and a remedy.
 
     """
-    suite_file, environment_file = out / "suite.toml", out / "environment.json"
+    suite_path, environment_file = out / "suite.toml", out / "environment.json"
     has_grown = False
-    if suite_file.exists():
+    if suite_path.exists():
         try:
-            old, new = read_stored(suite_file), toml(suite.text)
+            old, new = read_stored(suite_path), suite_file(toml(suite.text))
         except InputError as e:
             raise InputError(f"{e}; restore it, or use --fresh") from None
         has_grown = old != new
@@ -372,8 +370,8 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
     return has_grown
 
 
-def suite_text(folder: Path) -> str:
-    """Return the TOML of the suite of a result folder.
+def suite_of(folder: Path) -> SuiteFile:
+    """Return the suite of a result folder.
 
     Raises
     ------
@@ -381,9 +379,7 @@ def suite_text(folder: Path) -> str:
         If the file is missing, or is not a suite.
 
     """
-    path = folder / "suite.toml"
-    read_stored(path)
-    return read_text(path, "the suite of a result folder", MAX_TOML_MIB)
+    return read_stored(folder / "suite.toml")
 
 
 def environment_of(folder: Path, digest: str) -> dict[str, Any]:

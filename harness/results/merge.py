@@ -31,8 +31,8 @@ from mortarbench.harness.results.folder import (
     refuse_links,
 )
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.suite.growth import as_toml, unite
-from mortarbench.harness.suite.suite import read_stored
+from mortarbench.harness.suite.growth import unite
+from mortarbench.harness.suite.suite import as_toml, read_stored
 
 JOURNAL = "merged"  #: name of the only journal of a merged folder
 

@@ -13,16 +13,11 @@ from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Case, Family, Reference, Solver
 from mortarbench.harness.record import Record
 from mortarbench.harness.registry import SolverSpec, options_of, resolve
-from mortarbench.harness.results.folder import environment_of, suite_text
+from mortarbench.harness.results.folder import environment_of, suite_of
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import WorkUnit
-from mortarbench.harness.suite.solver_options import without_options
-from mortarbench.harness.suite.suite import (
-    NULL_SUFFIX,
-    limits,
-    solvers_by_label,
-    steps_up_to,
-)
+from mortarbench.harness.suite.solver_options import NULL_SUFFIX, without_options
+from mortarbench.harness.suite.suite import steps_up_to
 from mortarbench.harness.verify.verdicts import new_record, plain
 
 
@@ -62,26 +57,25 @@ def open_stored_run(
     """
     records = read_journal(folder)
     record = _find_record(folder, run_id, records)
-    environment, text = environment_of(folder, record.environment), suite_text(folder)
-    spec = _find_solver(record, solvers_by_label(text))
+    environment, suite = environment_of(folder, record.environment), suite_of(folder)
+    spec = _find_solver(record, {spec.label: spec for spec in suite.specs()})
     try:
         if record.family not in families:
             raise InputError(f"unknown family {record.family!r}")
         name = assemble(families[record.family], record.params, record.form)
         in_sequence = record.mode != "cold"
-        cases = steps_up_to(text, name, families) if in_sequence else (name,)
+        cases = steps_up_to(suite, name, families) if in_sequence else (name,)
         spec = _with_options(record, spec, solvers)
     except InputError as e:
         raise InputError(f"{record.run_id}: {e}{plugins_needed(environment)}") from None
-    time_limit, memory_limit = limits(text)
     return StoredRun(
         record=record,
         repeats=[r for r in records if _cell(r) == _cell(record)],
         cases=cases,
         spec=spec,
         environment=environment,
-        time_limit=time_limit,
-        memory_limit=memory_limit,
+        time_limit=suite.time_limit,
+        memory_limit=suite.memory_limit,
     )
 
 

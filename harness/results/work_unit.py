@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from mortarbench.harness.files.store import Arrays
 from mortarbench.harness.record import Record
@@ -40,10 +40,6 @@ class WorkUnit:
     turns: tuple[tuple[Record, ...], ...]
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
-    #: plain data of a small case, or None. If set, a new process builds the small case
-    #: and then the case of the block, so that the build time excludes the cost of first
-    #: calls. If None, a case that was built for an earlier block may be reused
-    warm_up: Mapping[str, Any] | None = None
 
     @property
     def cases(self) -> tuple[str, ...]:

@@ -54,8 +54,6 @@ class Executor:
     # reason why the sequence has fewer cases than requested steps; else empty
     _end_reason: str = ""
     _loaded: dict[str, QP] = field(default_factory=dict)  # QPs of `_entries`, by digest
-    # limit exceeded while building the cases of the current block; None otherwise
-    _limit_hit: _BuildLimitError | None = None
 
     def __post_init__(self) -> None:
         self._case_worker = WorkerProcess(
@@ -81,9 +79,6 @@ class Executor:
                 # on a cluster, this method is called once for each turn of a block
                 if block.number != self._number:
                     self._number, self._entries = block.number, ()
-                    self._limit_hit = None
-                    if block.warm_up is not None:
-                        self._case_worker.close()
                 for turn in block.turns:
                     yield from self._turn(block, turn)
             except _BuildError as e:
@@ -102,13 +97,6 @@ class Executor:
                     if result.record.run_id not in measured:
                         measured.add(result.record.run_id)
                         yield result
-                return
-            except _BuildLimitError as e:
-                self._limit_hit = e
-                message = f"building the case: {e.reason}"
-                for record in turn:
-                    ended = record.replace(verdict=e.verdict, message=message)
-                    yield Result(record=ended)
                 return
             except (FaultError, OSError) as e:
                 reason = " ".join(str(e).split())
@@ -189,19 +177,12 @@ class Executor:
         }
         if source.is_shared:
             request |= case_request(record)
-            # in a series of growing sizes, new processes build each case
-            if block.warm_up is not None:
-                self._worker(record.solver).close()
-                request["first"] = dict(block.warm_up)
         if source is Source.RANKS:
             return request, record
         entry = self._entries[step]
         if not source.is_shared:
             request |= {"qp": str(entry.qp), "digest": entry.digest}
-        keys = ["qp", "build_seconds", "dualise_seconds"]
-        # without a new process, the peak memory may include memory of earlier cases
-        if block.warm_up is not None:
-            keys.append("build_peak_mib")
+        keys = ("qp", "build_seconds", "dualise_seconds")
         meta = {key: entry.meta.get(key) for key in keys}
         return request, record.replace(**meta)
 
@@ -216,8 +197,6 @@ class Executor:
 
         If a sequence ends before the last step of `turn`, fewer cases are built.
         """
-        if self._limit_hit is not None:
-            raise self._limit_hit
         if self._entries:
             return
         entries: list[StoredCase] = []
@@ -266,15 +245,11 @@ class Executor:
     def _entry(self, record: Record, block: WorkUnit) -> StoredCase:
         def make(path: Path) -> Mapping[str, Any]:
             request = {"build": _case(record), "qp": str(path)}
-            if block.warm_up is not None:
-                request["first"] = dict(block.warm_up)
             meta: Mapping[str, Any] = self._ask_case_worker(request, block)["meta"]
             return meta
 
         r = record
-        identity: list[Any] = [r.family, r.params, r.form, r.environment]
-        if block.warm_up is not None:
-            identity += [r.session, r.block]
+        identity = [r.family, r.params, r.form, r.environment]
         return find_or_build(self.cases, identity, make)
 
     def _ask_case_worker(
@@ -290,19 +265,16 @@ class Executor:
             If the harness or the machine failed.
 
         """
-        is_limited = block.warm_up is not None
         # retry once: the process may have been killed from outside, or an earlier case
         # may have crashed it
         for _ in range(2):
             reply = self._case_worker.ask(
                 {**request, "keep": len(block.cases)},
-                time_limit=block.time_limit if is_limited else inf,
-                memory_limit=block.memory_limit if is_limited else inf,
+                time_limit=inf,
+                memory_limit=inf,
             )
             if reply.answer is not None:
                 break
-            if reply.verdict in (Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT):
-                raise _BuildLimitError(reply.message, reply.verdict)
         else:
             refuse_full_disk(self.scratch, reply.message)
             if reply.fault:
@@ -364,14 +336,6 @@ class _BuildError(Exception):
         self.reason = reason
         self.trace = trace
         self.past_end = past_end
-
-
-class _BuildLimitError(_BuildError):
-    """Time or memory limit exceeded while a case was built or evaluated."""
-
-    def __init__(self, reason: str, verdict: Verdict) -> None:
-        super().__init__(reason, "")
-        self.verdict = verdict
 
 
 def _case(r: Record) -> dict[str, Any]:

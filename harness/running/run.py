@@ -186,7 +186,7 @@ class _Recorder:
                         self._count(record, None)
             case MeasurementFault():
                 self._take_fault(outcome)
-            case Result() if self.schedule.is_settled(outcome.record):
+            case Result() if self.schedule.is_measured(outcome.record.run_id):
                 # a repetition of a block or sequence: only the first result counts
                 self._count(outcome.record, None)
             case Result():

@@ -12,15 +12,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from mortarbench.harness.names import CaseId
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.work_unit import WorkUnit
 from mortarbench.harness.running.progress import Progress
-from mortarbench.harness.suite.parameter_grid import Growth
 from mortarbench.harness.suite.suite import Group, Suite
 from mortarbench.harness.verify.verdicts import new_record
 
 Cell = tuple[str, str, float]  #: mode, name of the case, and tolerance
+LIMITS = (Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -38,8 +37,10 @@ class Schedule:
     _declined: set[tuple[str, Cell]] = field(
         default_factory=set
     )  # solver and cell of each declined case
-    #: solver and cell of answers that were not verified, in series of growing sizes
-    _ended: set[tuple[str, Cell]] = field(default_factory=set)
+    #: solver and cell of each case beyond a limit, see `add`
+    _beyond: set[tuple[str, Cell]] = field(default_factory=set)
+    #: number of variables by name of the case, for measured cases
+    _variables: dict[str, int] = field(default_factory=dict)
     _done: set[str] = field(
         default_factory=set
     )  # run IDs of the measurements in the journal
@@ -54,35 +55,34 @@ class Schedule:
         return len(s.names) * len(s.tolerances) * s.repeats * len(s.solvers)
 
     def add(self, record: Record) -> None:
-        """Take a measurement in the journal into account."""
+        """Take a measurement in the journal into account.
+
+        A solver that hit a limit is not measured on the later cases of a line of the
+        grid (`Suite.lines`) along which the number of variables grew up to this case.
+        """
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
+        if "variables" in record.sizes:
+            self._variables[record.case] = record.sizes["variables"]
         if record.verdict is Verdict.DECLINED:
             self._declined.add((record.solver, _cell(record)))
-        elif record.case in self.suite.growing and not record.verdict.is_verified:
-            self._ended.add((record.solver, _cell(record)))
+        if record.verdict in LIMITS and record.mode == "cold":
+            for line in self.suite.lines:
+                if record.case not in line[1:]:
+                    continue
+                place = line.index(record.case)
+                size, smaller = map(self._variables.get, line[place::-1][:2])
+                if size and smaller and size > smaller:
+                    cells = ((record.mode, c, record.tol) for c in line[place + 1 :])
+                    self._beyond.update((record.solver, cell) for cell in cells)
 
     def is_settled(self, record: Record) -> bool:
         """Return True if a measurement is in the journal, or is not needed.
 
-        A solver that declined a case would decline it in every repeat. In a series of
-        cases of growing size, a solver is no longer measured after its first answer
-        that is not verified.
+        A solver that declined a case would decline it in every repeat.
         """
         cell = record.solver, _cell(record)
-        if record.run_id in self._done or cell in self._declined | self._ended:
-            return True
-        growth = self.suite.growing.get(record.case)
-        return growth is not None and self._has_ended(record, growth)
-
-    def _has_ended(self, record: Record, growth: Growth) -> bool:
-        """Return True if the solver's answer to a smaller case was not verified."""
-        while growth.smaller:
-            cell = record.mode, growth.smaller, record.tol
-            if (record.solver, cell) in self._ended:
-                return True
-            growth = self.suite.growing[growth.smaller]
-        return False
+        return record.run_id in self._done or cell in self._declined | self._beyond
 
     def is_measured(self, run_id: str) -> bool:
         """Return True if the measurement is in the journal."""
@@ -159,28 +159,16 @@ class Schedule:
         if repeat % 2:
             turns.reverse()
         self._next += 1
-        growth = self.suite.growing.get(group.cases[0].name)
         return WorkUnit(
             number=turns[0][0].block,
             turns=tuple(turns),
             time_limit=self.suite.time_limit,
             memory_limit=self.suite.memory_limit,
-            warm_up=None if growth is None else _fields(growth.warm_up),
         )
 
     def _skip(self, cells: int) -> None:
         for _ in range(cells):
             self.progress.advance(None)
-
-
-def _fields(case: CaseId) -> dict[str, Any]:
-    """Return the NAME of a case in requests to `harness.processes.case_worker`."""
-    return {
-        "family": case.family.name,
-        "params": dict(case.params),
-        "form": case.form,
-        "name": case.name,
-    }
 
 
 def _cell(record: Record) -> Cell:

@@ -10,63 +10,59 @@ result folder must not change either.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from itertools import chain, combinations
+from itertools import combinations
 from typing import Any
 
+import msgspec
+
 from mortarbench.harness.errors import InputError, shown
-from mortarbench.harness.suite.suite import DEFAULTS, suite_text
+from mortarbench.harness.suite.suite import SuiteFile
 
 #: settings that must not change, since stored verdicts and times depend on them
 FIXED_KEYS = ("time_limit", "memory_limit", "accuracy")
+
 _AND = "-and-"  #: separator of the names of united suites
 
-Table = Mapping[str, Any]  #: content of a suite's TOML
 
-
-def incompatibility(old: Table, new: Table) -> str:
+def incompatibility(old: SuiteFile, new: SuiteFile) -> str:
     """Describe the first change that is not permitted; return "" if all are permitted.
 
     Cases are not compared here; `harness.running.run` compares them with the journal.
     """
-    both = {**DEFAULTS, **old}, {**DEFAULTS, **new}
-    return next(chain(_settings(*both), _members(*both)), "")
+    return next(_changes(old, new), "")
 
 
-def _settings(old: Table, new: Table) -> Iterator[str]:
+def _changes(old: SuiteFile, new: SuiteFile) -> Iterator[str]:
     for key in ("name", *FIXED_KEYS):
-        if old.get(key) != new.get(key):
-            yield _change(key, old.get(key), new.get(key))
-    if new["repeats"] < old["repeats"]:
-        yield f"{_change('repeats', old['repeats'], new['repeats'])}; it may only grow"
-
-
-def _members(old: Table, new: Table) -> Iterator[str]:
-    if old["null_arm"] not in (None, new["null_arm"]):
-        yield _change("null_arm", old["null_arm"], new["null_arm"])
-    for tol in old["tolerances"]:
-        if tol not in new["tolerances"]:
+        before, now = getattr(old, key), getattr(new, key)
+        if before != now:
+            yield f"{key} was {_text(before)}, now {_text(now)}"
+    if new.repeats < old.repeats:
+        yield f"repeats was {old.repeats}, now {new.repeats}; it may only grow"
+    if old.null_arm not in (None, new.null_arm):
+        yield f"null_arm was {_text(old.null_arm)}, now {_text(new.null_arm)}"
+    for tol in old.tolerances:
+        if tol not in new.tolerances:
             yield f"tolerance {tol:g} is missing; tolerances may be added"
-    solvers = _entries(new)
-    for label, entry in _entries(old).items():
-        if label not in solvers:
-            yield f"solver {shown(label)} is missing; solvers may be added"
-        elif solvers[label]["name"] != entry["name"]:
-            name = f"solver {shown(label)}"
-            yield _change(name, entry["name"], solvers[label]["name"])
-
-
-def _change(name: str, old: object, new: object) -> str:
-    return f"{name} was {_text(old)}, now {_text(new)}"
+    names = {spec.label: spec.name for spec in new.specs()}
+    for spec in old.specs():
+        if spec.label not in names:
+            yield f"solver {shown(spec.label)} is missing; solvers may be added"
+        elif names[spec.label] != spec.name:
+            now = shown(names[spec.label])
+            yield f"solver {shown(spec.label)} was {shown(spec.name)}, now {now}"
 
 
 def _text(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
     return "not set" if value is None else shown(value)
 
 
-def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
+def unite(suites: Mapping[str, SuiteFile]) -> dict[str, Any]:
     """Return a suite with the measurements of all suites; the first sets the rest.
 
-    tables : results of `harness.suite.suite.read_stored` by folder
+    suites : results of `harness.suite.suite.read_stored` by folder
 
     Raises
     ------
@@ -75,72 +71,45 @@ def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
         a label.
 
     """
-    union: dict[str, Any] = {}
-    for (one, a), (other, b) in combinations(tables.items(), 2):
+    for (one, a), (other, b) in combinations(suites.items(), 2):
         _refuse_unequal(one, a, other, b)
-    for table in tables.values():
-        _add(union, table)
+    if not suites:
+        return {}
+    merged = {
+        key: tuple(e for i, e in enumerate(entries) if e not in entries[:i])
+        for key in ("tolerances", "solvers", "problems")
+        if (entries := [e for suite in suites.values() for e in getattr(suite, key)])
+    }
+    names = [name for suite in suites.values() for name in suite.name.split(_AND)]
+    first, *_ = suites.values()
+    union: dict[str, Any] = msgspec.to_builtins(
+        msgspec.structs.replace(
+            first,
+            name=_AND.join(dict.fromkeys(names)),
+            repeats=max(suite.repeats for suite in suites.values()),
+            **merged,
+        )
+    )
     return union
 
 
-def _refuse_unequal(one: str, a: Table, other: str, b: Table) -> None:
+def _refuse_unequal(one: str, a: SuiteFile, other: str, b: SuiteFile) -> None:
     """Refuse suites `a`, `b` of two folders with unequal settings or labels."""
     for key in FIXED_KEYS:
-        values = a.get(key, DEFAULTS[key]), b.get(key, DEFAULTS[key])
+        values = getattr(a, key), getattr(b, key)
         if values[0] != values[1]:
             raise InputError(
                 f"{key} is {_text(values[0])} in {one}, {_text(values[1])} in {other}; "
                 "expected equal settings"
             )
-    entries = _entries(a), _entries(b)
-    for label in sorted(entries[0].keys() & entries[1].keys()):
-        values = entries[0][label], entries[1][label]
+    solvers = [
+        {s.label: {"name": s.name, **s.options} for s in f.specs()} for f in (a, b)
+    ]
+    for label in sorted(solvers[0].keys() & solvers[1].keys()):
+        values = solvers[0][label], solvers[1][label]
         if values[0] != values[1]:
             raise InputError(
                 f"the label {shown(label)} is {_text(values[0])} in {one}, "
                 f"{_text(values[1])} in {other}; expected labels to denote the same "
                 "solver with the same options in all folders"
             )
-
-
-def _add(union: dict[str, Any], table: Table) -> None:
-    """Add the measurements of a suite to the union, in place."""
-    if not union:
-        union |= table
-        return
-    names = [
-        *str(union.get("name", "")).split(_AND),
-        *str(table.get("name")).split(_AND),
-    ]
-    union["name"] = _AND.join(dict.fromkeys(filter(None, names)))
-    if "repeats" in table:
-        repeats = union.get("repeats", DEFAULTS["repeats"])
-        union["repeats"] = max(table["repeats"], repeats)
-    for key in ("tolerances", "solvers", "problems"):
-        if key not in union.keys() | table.keys():
-            continue
-        present = list(union.get(key, DEFAULTS.get(key, ())))
-        more = table.get(key, DEFAULTS.get(key, ()))
-        union[key] = present + [entry for entry in more if entry not in present]
-
-
-def _entries(table: Table) -> dict[str, Mapping[str, Any]]:
-    """Return the name and the options of each solver of a suite by label."""
-    entries = (
-        entry if isinstance(entry, Mapping) else {"name": entry}
-        for entry in table.get("solvers", ())
-    )
-    return {
-        str(e.get("label", e.get("name"))): {
-            "name": str(e.get("name")),
-            **dict(e.get("options", {})),
-        }
-        for e in entries
-    }
-
-
-def as_toml(table: Table) -> str:
-    """Return a suite as TOML, with nested tables on one line each."""
-    blocks = table.get("problems", ())
-    head = suite_text({k: v for k, v in table.items() if k != "problems"})
-    return "\n[[problems]]\n".join([head, *map(suite_text, blocks)])

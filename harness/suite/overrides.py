@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -14,8 +13,8 @@ from mortarbench.harness.files.reading import toml
 from mortarbench.harness.names import CaseId, match, parse
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.registry import SolverSpec, resolve
-from mortarbench.harness.suite.solver_options import sweep
-from mortarbench.harness.suite.suite import NULL_SUFFIX, Suite
+from mortarbench.harness.suite.solver_options import NULL_SUFFIX, sweep
+from mortarbench.harness.suite.suite import Suite, as_toml
 
 
 def with_overrides(
@@ -28,7 +27,7 @@ def with_overrides(
     repeats: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
-    options: Mapping[str, Sequence[str]] | None = None,
+    options: Mapping[str, Sequence[Any]] | None = None,
 ) -> Suite:
     """Return a suite changed by options of the command line.
 
@@ -36,8 +35,7 @@ def with_overrides(
         registry to run instead; empty to keep all solvers of the suite
     cases : names of cases to select, or shell globs over canonical names; empty to
         keep all cases
-    options : values of solver options, as texts; if an option has several values, each
-        solver is run in several variants, one for each value
+    options : values of solver options, see `sweep`
 
     Raises
     ------
@@ -69,21 +67,16 @@ def with_overrides(
         changes |= _chosen_cases(suite, cases, families)
     if repeats is not None:
         changes["repeats"] = checked.at_least_one("--repeats", repeats)
-    text = suite.text
-    for key, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
-        if limit is not None:
-            changes[key] = checked.positive(f"--{key.replace('_', '-')}", limit)
-            # Results depend on the limits, so a suite with different limits counts as a
-            # different suite, and the stored text must contain the limits. Results do
-            # not depend on the selection of solvers and cases. In TOML, top-level keys
-            # must precede all tables.
-            line = f"{key} = {limit!r}"
-            if key in toml(text):
-                old = rf"^[ \t]*{key}[ \t]*=.*$"
-                text = re.sub(old, line, text, count=1, flags=re.MULTILINE)
-            else:
-                text = f"{line}\n{text}"
-    return replace(suite, text=text, **changes)
+    limits: dict[str, Any] = {
+        key: checked.positive(f"--{key.replace('_', '-')}", limit)
+        for key, limit in (("time_limit", time_limit), ("memory_limit", memory_limit))
+        if limit is not None
+    }
+    # Results depend on the limits, so a suite with different limits counts as a
+    # different suite, and the stored text must contain the limits. Results do not
+    # depend on the selection of solvers and cases.
+    text = as_toml({**toml(suite.text), **limits}) if limits else suite.text
+    return replace(suite, text=text, **changes, **limits)
 
 
 def _chosen_cases(

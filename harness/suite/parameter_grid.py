@@ -3,50 +3,58 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from glob import escape, glob
-from itertools import cycle, product
+from itertools import product
 from math import prod
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Annotated, Any
 
-from mortarbench.harness import checked
+from msgspec import Meta, Struct
+
+from mortarbench.harness.checked import located
 from mortarbench.harness.errors import PLUGINS, InputError, shown, some, unknown
 from mortarbench.harness.names import CaseId, assemble, split_row
 from mortarbench.harness.plugin import Family
 
-_PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence", "growing")
+Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]+$")]
+Texts = Annotated[tuple[Text, ...], Meta(min_length=1)]
 
 
-@dataclass(frozen=True)
-class Growth:
-    """Position of a case in a series of growing sizes."""
+class Problem(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True
+):
+    """Entry of ``problems`` in a suite: a grid of cases of one family."""
 
-    smaller: str  #: name of the next smaller case of the series; empty for the smallest
-    warm_up: CaseId  #: the same case with the default size of the family
+    family: Text
+    forms: Texts | None = None  #: None for all forms of the family
+    params: dict[str, Any] = {}  #: value of each key, or list of its values
+    zip: tuple[Texts, ...] = ()  #: groups of keys whose lists vary together
+    sequence: Text | None = None  #: key whose values are the steps of a sequence
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Problems:
-    """All cases of a suite."""
+class Cases:
+    """All cases of a suite, without duplicates."""
 
     cold: tuple[CaseId, ...]  #: cases solved without results of other cases
     sequences: tuple[tuple[CaseId, ...], ...]  #: steps of each sequence, in order
-    growing: Mapping[str, Growth]  #: position of each case in a series of growing sizes
+    #: names of the cold cases along each list of `Problem.params`, in its order
+    lines: tuple[tuple[str, ...], ...]
 
 
 def expand_problems(
-    blocks: object, families: Mapping[str, Family], folder: Path, most: int
-) -> Problems:
-    """Return all cases of a suite: single cases, sequences, series of growing sizes.
+    problems: Sequence[Problem],
+    families: Mapping[str, Family],
+    folder: Path,
+    most: int,
+) -> Cases:
+    """Return all cases of a suite: single cases and sequences.
 
-    A case that occurs in several blocks is returned once. The cases of a sequence, or
-    of a series of growing sizes, differ only in the key of the sequence or series and
-    in keys that are zipped with this key. The cases have the order of the values of the
-    key.
+    The first key of a grid varies slowest, and forms vary fastest. The cases of a line
+    or of a sequence differ only in one key and in the keys that are zipped with it.
 
-    blocks : value of ``problems`` in the suite
     folder : folder of the suite, to which relative paths refer if they do not exist in
         the working directory
     most : largest total number of cases
@@ -54,123 +62,158 @@ def expand_problems(
     Raises
     ------
     InputError
-        If a block is invalid or there are too many cases; the message names the block.
+        If an entry is invalid or there are too many cases; the message names the entry.
 
     """
     cold: dict[str, CaseId] = {}
-    sequences: dict[str, tuple[CaseId, ...]] = {}
-    growing: dict[str, Growth] = {}
-    for block in _blocks(blocks, families, folder, most):
-        if block.kind != "sequence":
-            for case in block.cases:
-                cold.setdefault(case.name, case)
-        steps: dict[str, list[CaseId]] = {}
-        for case, given in zip(block.cases, block.given, strict=True):
-            rest = {k: v for k, v in given.items() if k not in block.along}
-            steps.setdefault(f"{case.form} {rest}", []).append(case)
-            if block.kind == "growing":
-                smaller = steps[f"{case.form} {rest}"][-2:-1]
-                growing[case.name] = Growth(
-                    smaller[0].name if smaller else "",
-                    assemble(case.family, rest, case.form),
-                )
-        if block.kind == "sequence":
-            sequences |= {repr(cases): tuple(cases) for cases in steps.values()}
-    return Problems(
-        cold=tuple(cold.values()),
-        sequences=tuple(sequences.values()),
-        growing=growing,
-    )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Block:
-    cases: list[CaseId]
-    given: list[dict[str, object]]  #: keys that the suite sets, for each case
-    kind: str  #: "sequence", "growing" or, for single cases, ""
-    #: keys that vary in the sequence or series; () for single cases
-    along: tuple[str, ...]
-
-
-def _blocks(
-    blocks: object, families: Mapping[str, Family], folder: Path, most: int
-) -> Iterator[_Block]:
-    """Check the entries of ``problems``, and yield their cases as blocks."""
+    sequences: dict[tuple[str, ...], tuple[CaseId, ...]] = {}
+    lines: list[tuple[str, ...]] = []
     # number of cases, checked before the cases are created: a grid may span billions
     count = 0
-    for i, block in enumerate(checked.filled_list("problems", blocks)):
-        with checked.located(f"problems[{i}]"):
-            table = checked.table("entry", block)
-            checked.only_keys(table, _PROBLEM_KEYS)
-            if "family" not in table:
-                raise InputError("family is missing")
-            name = checked.text("family", table["family"])
-            if name not in families:
-                raise unknown("family", name, families, more=PLUGINS)
-            family = families[name]
-            params = checked.table("params", table.get("params", {}))
-            for key in params:
-                if key not in family.defaults:
-                    raise unknown("key", key, family.defaults, where=name)
-            kind, along_key = _along(table, params)
-            forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
-            if family.path_suffix is not None and "path" in params:
-                params = {**params, "path": _expanded(params["path"], folder, family)}
-            axes = _axes(params, table.get("zip", []))
-            along = next((tuple(axis[0]) for axis in axes if along_key in axis[0]), ())
+    for number, problem in enumerate(problems):
+        with located(f"problems[{number}]"):
+            if problem.family not in families:
+                raise unknown("family", problem.family, families, more=PLUGINS)
+            family = families[problem.family]
+            forms = problem.forms or family.forms
+            axes, steps = _axes(problem, _params(problem, folder, family))
             count += prod(map(len, axes)) * len(forms)
             if count > most:
                 raise InputError(
                     f"the grid spans {count} cases; expected at most {most} in all; "
                     f"take fewer values, or set max_cases = {count} in the suite"
                 )
-            given = [point for point in _points(axes) for _ in forms]
-            cases = [
-                assemble(family, point, checked.text("forms", form))
-                for point, form in zip(given, cycle(forms), strict=False)
-            ]
-            yield _Block(cases=cases, given=given, kind=kind, along=along)
+            every, along = _grid(axes, family, forms)
+            if steps is None:
+                cold.update((case.name, case) for case in every)
+            for (axis, *_), cases in along.items():
+                names = tuple(case.name for case in cases)
+                if axis == steps:
+                    sequences[names] = tuple(cases)
+                elif steps is None and len(cases) > 1:
+                    lines.append(names)
+    return Cases(
+        cold=tuple(cold.values()),
+        sequences=tuple(sequences.values()),
+        lines=tuple(lines),
+    )
+
+
+def _grid(
+    axes: Sequence[Sequence[Mapping[str, Any]]], family: Family, forms: Sequence[str]
+) -> tuple[list[CaseId], dict[tuple[Any, ...], list[CaseId]]]:
+    """Return the cases of a grid, and the cases along each axis.
+
+    Lists of the second result belong to the number of the axis, the form, and the
+    places on the other axes.
+    """
+    cases: list[CaseId] = []
+    along: dict[tuple[Any, ...], list[CaseId]] = {}
+    for index in product(*(range(len(axis)) for axis in axes)):
+        rows = (axis[i] for axis, i in zip(axes, index, strict=True))
+        point = {key: value for row in rows for key, value in row.items()}
+        for form in forms:
+            cases.append(assemble(family, point, form))
+            for axis in range(len(axes)):
+                others = (*index[:axis], *index[axis + 1 :])
+                along.setdefault((axis, form, others), []).append(cases[-1])
+    return cases, along
+
+
+def _params(problem: Problem, folder: Path, family: Family) -> dict[str, Any]:
+    """Return the keys that an entry sets, with the files that its paths denote."""
+    for key in problem.params:
+        if key not in family.defaults:
+            raise unknown("key", key, family.defaults, where=problem.family)
+    if family.path_suffix is None or "path" not in problem.params:
+        return problem.params
+    path = _expanded(problem.params["path"], folder, family)
+    return {**problem.params, "path": path}
+
+
+def _axes(
+    problem: Problem, params: Mapping[str, Any]
+) -> tuple[list[list[dict[str, Any]]], int | None]:
+    """Return the axes of a grid, and the number of the axis of the sequence, or None.
+
+    An axis is a list of dicts from keys to values. Keys that are zipped belong to the
+    axis of the first of them; any other key has its own axis.
+    """
+    lists = [key for key, value in params.items() if isinstance(value, list)]
+    zipped: dict[str, Sequence[str]] = {}
+    for group in problem.zip:
+        for key in group:
+            if key not in lists or key in zipped:
+                raise InputError(
+                    f"zip: {shown(key)} is not a list in params, or is paired twice; "
+                    'expected groups of such keys, like [["Nr", "Nh"]]'
+                )
+            zipped[key] = group
+        if len({len(params[key]) for key in group}) > 1:
+            lengths = ", ".join(f"{key} has {len(params[key])}" for key in group)
+            raise InputError(f"zip: {lengths} values; expected lists of equal length")
+    sequence = problem.sequence
+    if sequence is not None and (sequence not in lists or len(params[sequence]) < 2):
+        hint = f"; the lists are {some(lists)}" if lists else ""
+        raise InputError(
+            f"sequence = {shown(sequence)} is not a list in params; expected the key "
+            f"whose values are the steps{hint}"
+        )
+    axes: list[list[dict[str, Any]]] = []
+    steps, done = None, set[str]()
+    for key in params:
+        if key in done:
+            continue
+        together = zipped.get(key, (key,))
+        done.update(together)
+        if sequence in together:
+            steps = len(axes)
+        columns = [params[k] if k in lists else [params[k]] for k in together]
+        if not columns[0]:
+            raise InputError(f"params.{key} is empty; expected at least one entry")
+        rows = zip(*columns, strict=True)
+        axes.append([dict(zip(together, row, strict=True)) for row in rows])
+    return axes, steps
 
 
 def _expanded(paths: object, folder: Path, family: Family) -> object:
-    """Replace shell patterns among paths by the matching files, sorted by name.
-
-    A file with several problems is replaced by the paths of its problems.
-    """
+    """Replace paths by the files that they denote, and files by their problems."""
     expanded: list[object] = []
     for path in paths if isinstance(paths, list) else [paths]:
-        if _is_pattern(path, folder, family):
-            files: Sequence[object] = _matching(str(path), folder, family)
+        if isinstance(path, str) and path:
+            for file in _files(path, folder, family):
+                expanded += family.problems_in(file)
         else:
-            files = [_located({"path": path}, folder, family)["path"]]
-        for file in files:
-            expanded += family.problems_in(file) if isinstance(file, str) else [file]
+            expanded.append(path)
     return expanded if len(expanded) != 1 or isinstance(paths, list) else expanded[0]
 
 
-def _is_pattern(path: object, folder: Path, family: Family) -> bool:
-    """Return True if a path contains wildcards and no file has exactly this path."""
-    if not isinstance(path, str) or not set("*?[") & set(path):
-        return False
-    if os.path.exists(path) or (folder / path).exists():
-        return False
-    return not _copied(escape(path), family)
+def _files(path: str, folder: Path, family: Family) -> list[str]:
+    """Return the files that a path or a shell pattern denotes, sorted by name.
 
-
-def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
-    """Return the files that match a pattern, relative to the working directory.
-
-    The result includes files that are missing but have a copy in the result folder. If
-    there is no match, the pattern is interpreted relative to the folder of the suite.
+    Files are searched relative to the working directory, then relative to the folder of
+    the suite, then among the files copied to the result folder, which a path or pattern
+    denotes if it matches the last components of their paths.
     """
-    missing = {p for p in _copied(pattern, family) if not os.path.lexists(p)}
-    if paths := sorted({*filter(os.path.isfile, glob(pattern)), *missing}):
-        return paths
-    beside = glob(os.path.join(escape(str(folder)), pattern))
-    if paths := sorted(map(os.path.relpath, filter(os.path.isfile, beside))):
-        return paths
+    file, _ = split_row(path)
+    row = path.removeprefix(file)
+    if Path(file).is_file():
+        return [path]
+    if (beside := folder / file).is_file():
+        return [f"{os.path.relpath(beside)}{row}"]
+    copied = _copied(escape(file), family)
+    if file not in copied and len(copied) == 1:
+        return [f"{copied[0]}{row}"]
+    if copied or not set("*?[") & set(path):
+        return [path]
+    missing = {p for p in _copied(path, family) if not os.path.lexists(p)}
+    if here := sorted({*filter(os.path.isfile, glob(path)), *missing}):
+        return here
+    there = glob(os.path.join(escape(str(folder)), path))
+    if files := sorted(map(os.path.relpath, filter(os.path.isfile, there))):
+        return files
     raise InputError(
-        f"params.path = {shown(pattern)} matches no file; expected a pattern relative "
+        f"params.path = {shown(path)} matches no file; expected a pattern relative "
         "to the working directory or to the folder of the suite"
     )
 
@@ -180,86 +223,3 @@ def _copied(pattern: str, family: Family) -> list[str]:
     if not PurePath(pattern).parts:
         return []
     return [path for path in family.copied_paths() if PurePath(path).match(pattern)]
-
-
-def _located(
-    point: dict[str, object], folder: Path, family: Family
-) -> dict[str, object]:
-    """Return the keys of a case, with a path that leads to its file.
-
-    If the path does not exist relative to the working directory, the path is
-    interpreted relative to the folder of the suite. If the file is also missing in this
-    folder, and the result folder lists exactly one copied file that matches, the listed
-    path is returned.
-    """
-    match point:
-        case {"path": str(text)} if text:
-            file, _ = split_row(text)
-            row = text.removeprefix(file)
-            if Path(file).is_file():
-                return point
-            if (beside := folder / file).is_file():
-                return {**point, "path": f"{os.path.relpath(beside)}{row}"}
-            copied = _copied(escape(file), family)
-            if file not in copied and len(copied) == 1:
-                return {**point, "path": f"{copied[0]}{row}"}
-    return point
-
-
-def _along(table: Mapping[str, Any], params: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the kind of a block and the key that varies; "", "" for single cases."""
-    kinds = [kind for kind in ("sequence", "growing") if kind in table]
-    if not kinds:
-        return "", ""
-    if len(kinds) > 1:
-        raise InputError("sequence and growing are both set; expected only one of them")
-    (kind,) = kinds
-    key = table[kind]
-    values = params.get(checked.text(kind, key))
-    if not isinstance(values, list) or len(values) < 2:
-        lists = [k for k, v in params.items() if isinstance(v, list)]
-        hint = f"; the lists are {some(lists)}" if lists else ""
-        raise InputError(
-            f"{kind} = {shown(key)} is not a list in params; expected the key whose "
-            f"values are the {'steps' if kind == 'sequence' else 'sizes'}{hint}"
-        )
-    return kind, str(key)
-
-
-def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, object]]]:
-    """Return the axes of a grid, each a list of dicts from keys to values.
-
-    Keys that are zipped belong to the same axis; any other key has its own axis.
-    """
-    columns = {
-        key: checked.filled_list(f"params.{key}", v) if isinstance(v, list) else [v]
-        for key, v in table.items()
-    }
-    zipped: dict[str, list[str]] = {}
-    for group in checked.any_list("zip", groups):
-        for key in checked.filled_list("zip", group):
-            if (
-                not isinstance(table.get(checked.text("zip", key)), list)
-                or key in zipped
-            ):
-                raise InputError(
-                    f"zip: {shown(key)} is not a list in params, or is paired twice; "
-                    'expected groups of such keys, like [["Nr", "Nh"]]'
-                )
-            zipped[key] = group
-        if len({len(columns[key]) for key in group}) > 1:
-            lengths = ", ".join(f"{key} has {len(columns[key])}" for key in group)
-            raise InputError(f"zip: {lengths} values; expected lists of equal length")
-    axes = []
-    for key in columns:
-        together = zipped.get(key, [key])
-        if key == min(together, key=list(columns).index):
-            rows = zip(*(columns[k] for k in together), strict=True)
-            axes.append([dict(zip(together, row, strict=True)) for row in rows])
-    return axes
-
-
-def _points(axes: Sequence[list[dict[str, object]]]) -> Iterator[dict[str, object]]:
-    """Yield the points of a grid as dicts; the first axis varies slowest."""
-    for point in product(*axes):
-        yield {k: v for part in point for k, v in part.items()}

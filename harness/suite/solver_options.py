@@ -1,5 +1,6 @@
-"""Options of solvers from the command line: ``KEY=VALUE``, with lists for sweeps.
+"""Options of solvers: several values of an option span a grid of labelled solvers.
 
+Values come from a suite, from ``--option [SOLVER.]KEY=VALUE``, or from a Python caller.
 A value is converted to the type of the option, which is the annotation of the dataclass
 field. If the field has no annotation, or its annotation is Any or object, the type of
 the default is used.
@@ -16,53 +17,60 @@ from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
+import msgspec
+
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.registry import SolverSpec, option_types, options_of, resolve
-from mortarbench.harness.suite.suite import NULL_SUFFIX
 
-_KEY = re.compile(r"[^\W\d]\w*")
-# stricter than int() and float(), which accept 1_0 and digits of other scripts
-_NUMBERS = {
-    int: (re.compile(r"[+-]?[0-9]+"), "an integer"),
-    float: (
-        re.compile(r"[+-]?(inf|([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?)"),
-        "a number",
-    ),
-}
-_TRUTH = {"true": True, "false": False}
+#: End of the label of the second copy of a solver in an A/A comparison (``null_arm``).
+NULL_SUFFIX = " (A/A)"
+_KEY = re.compile(r"(?:[^=]+\.)?[^\W\d]\w*")
+#: types of an option whose default is None and that has no annotation; an integer is
+#: not read as a float, and 1 is not read as true
+_ANY = (int, float, bool, str, NoneType)
 _PLAIN = (bool, Real, str, NoneType)  #: types of values that Python callers may pass
-_MAX_VARIANTS = 1000  #: largest number of variants of one solver in a sweep
+_MAX_VARIANTS = 1000  #: largest number of variants of one solver
+#: types in messages, by the names that Python or msgspec use
+_WORDS = {
+    "int": "an integer",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "a string",
+    "NoneType": "none",
+    "null": "none",
+    "array": "a list",
+    "object": "a table",
+}
 
 
-def parse_options(texts: Iterable[str]) -> dict[str, list[str]]:
-    """Parse texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE``, and return the values by key.
-
-    Values of a key that occurs in several texts are joined.
+def parse_options(texts: Iterable[str]) -> dict[str, list[Any]]:
+    """Parse texts ``[SOLVER.]KEY=VALUE``, and return the values by ``[SOLVER.]KEY``.
 
     Raises
     ------
     InputError
         If a text does not have this form.
 
-    >>> parse_options(["max_iter=50,100", "rho=0.1", "max_iter=200"])
-    {'max_iter': ['50', '100', '200'], 'rho': ['0.1']}
+    >>> parse_options(["max_iter=50", "osqp.rho=0.1", "max_iter=200"])
+    {'max_iter': ['50', '200'], 'osqp.rho': ['0.1']}
 
     """
-    options: dict[str, list[str]] = {}
+    options: dict[str, list[Any]] = {}
     for text in texts:
-        key, equals, values = text.partition("=")
-        if not equals or not _KEY.fullmatch(key) or not all(values.split(",")):
+        key, _, value = text.partition("=")
+        if not value or not _KEY.fullmatch(key):
             raise InputError(
-                f"--option {shown(text)}; expected KEY=VALUE, such as max_iter=50"
+                f"--option {shown(text)}; expected [SOLVER.]KEY=VALUE, such as "
+                "max_iter=50"
             )
-        options.setdefault(key, []).extend(values.split(","))
+        options.setdefault(key, []).append(value)
     return options
 
 
-def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Convert options from a Python caller to texts, as on the command line.
+def listed_options(options: object) -> dict[str, list[Any]]:
+    """Return the values by key of options from a Python caller, as `parse_options`.
 
     Raises
     ------
@@ -75,20 +83,19 @@ def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
         raise InputError(
             f'options = {shown(options)}; expected a dict such as {{"max_iter": 50}}'
         )
-    texts: dict[str, list[str]] = {}
+    values: dict[str, list[Any]] = {}
     for key, value in options.items():
         if not isinstance(key, str) or not _KEY.fullmatch(key):
             raise InputError(
                 f"options: {shown(key)} is not a name; expected one such as max_iter"
             )
-        values = value if isinstance(value, list | tuple) else [value]
-        if not values or not all(isinstance(v, _PLAIN) for v in values):
+        values[key] = list(value) if isinstance(value, list | tuple) else [value]
+        if not values[key] or not all(isinstance(v, _PLAIN) for v in values[key]):
             raise InputError(
                 f"options: {key} = {shown(value)}; expected a number, string, True, "
                 "False or None, or a list of these"
             )
-        texts[key] = [*map(_text, values)]
-    return texts
+    return values
 
 
 def options_for(
@@ -105,26 +112,20 @@ def options_for(
         refuses.
 
     """
-    options_of_texts = parse_options(texts)
-    if not options_of_texts:
-        return {}
-    with located("--option"):
-        for key, values in options_of_texts.items():
-            if len(values) > 1:
-                raise InputError(
-                    f"{key} has {len(values)} values; expected one value, since only "
-                    "`run` sweeps options"
-                )
-        spec = SolverSpec(name=name, label=name)
-        single = {key: value for key, (value,) in options_of_texts.items()}
-        options = _typed(name, resolve(spec, registry), single)
-        resolve(replace(spec, options=options), registry)
-    return options
+    given = parse_options(texts)
+    for key, values in given.items():
+        if len(values) > 1:
+            raise InputError(
+                f"--option: {key} has {len(values)} values; expected one value, since "
+                "only `run` measures several"
+            )
+    (spec,) = sweep([SolverSpec(name=name, label=name)], given, registry)
+    return dict(spec.options)
 
 
 def sweep(
     specs: Sequence[SolverSpec],
-    given: Mapping[str, Sequence[str]],
+    given: Mapping[str, Sequence[Any]],
     registry: Mapping[str, Solver],
 ) -> tuple[SolverSpec, ...]:
     """Return a variant of each solver for every combination of option values.
@@ -133,7 +134,8 @@ def sweep(
     lacks some of the options, only its existing options are varied. A solver without
     any of the options is returned unchanged.
 
-    given : values by option
+    given : values by ``KEY``, or by ``SOLVER.KEY`` for the solvers with this label or
+        name
 
     Raises
     ------
@@ -143,60 +145,124 @@ def sweep(
     """
     if not given:
         return tuple(specs)
-    solvers = [resolve(spec, registry) for spec in specs]
-    names = {name for solver in solvers for name in options_of(solver)}
-    for key in given:
-        if key not in names:
-            raise unknown("option", key, names, where="--option")
+    used: set[str] = set()
     variants: dict[str, SolverSpec] = {}  # by label
-    for spec, solver in zip(specs, solvers, strict=True):
-        for options in _combinations(spec.name, solver, given):
-            null = NULL_SUFFIX if spec.role == "null" else ""
-            label = f"{with_options(spec.label.removesuffix(null), options)}{null}"
-            if label in variants:
-                raise InputError(
-                    f"--option: {label!r} occurs twice; expected distinct values"
-                )
-            changed = replace(spec, label=label, options={**spec.options, **options})
-            with located("--option"):
-                resolve(changed, registry)
-            variants[label] = changed
+    with located("--option"):
+        for spec in specs:
+            known = options_of(resolve(spec, registry))
+            axes = {}
+            for full, values in given.items():
+                solver, _, key = full.rpartition(".")
+                if solver in ("", spec.label, spec.name) and key in known:
+                    axes[key] = values
+                    used.add(full)
+            for variant in with_values(spec, axes, registry):
+                if variant.label in variants:
+                    raise InputError(
+                        f"{variant.label!r} occurs twice; expected distinct values"
+                    )
+                variants[variant.label] = variant
+        for full in given.keys() - used:
+            solver, _, key = full.rpartition(".")
+            chosen = [s for s in specs if solver in ("", s.label, s.name)]
+            if not chosen:
+                raise unknown("solver", solver, [s.label for s in specs])
+            names = {k for s in chosen for k in options_of(resolve(s, registry))}
+            where = solver or (specs[0].name if len(specs) == 1 else "")
+            raise unknown("option", key, names, where=where)
     return tuple(variants.values())
 
 
-def _combinations(
-    name: str, solver: Solver, given: Mapping[str, Sequence[str]]
-) -> Iterator[dict[str, Any]]:
-    axes = {key: given[key] for key in given if key in options_of(solver)}
-    if (count := prod(map(len, axes.values()))) > _MAX_VARIANTS:
+def grid(spec: SolverSpec, registry: Mapping[str, Solver]) -> Iterator[SolverSpec]:
+    """Yield a variant of a solver for every combination of the lists in its options.
+
+    A list spans a grid unless the list is itself a value of the type of the option.
+
+    Raises
+    ------
+    InputError
+        If the solver or an option is unknown, or if the solver refuses a value.
+
+    """
+    solver = resolve(replace(spec, options={}), registry)
+    axes = {
+        key: value
+        for key, value in spec.options.items()
+        if isinstance(value, list)
+        and key in options_of(solver)
+        and not _is_value(value, _kinds(solver, key))
+    }
+    fixed = {k: v for k, v in spec.options.items() if k not in axes}
+    return with_values(replace(spec, options=fixed), axes, registry)
+
+
+def with_values(
+    spec: SolverSpec, axes: Mapping[str, Sequence[Any]], registry: Mapping[str, Solver]
+) -> Iterator[SolverSpec]:
+    """Yield `spec` with every combination of the values of the options in `axes`."""
+    solver = resolve(spec, registry)
+    if (count := prod(map(len, axes.values()))) > _MAX_VARIANTS or not count:
         raise InputError(
-            f"--option spans {count} variants of {name}; expected at most "
+            f"options span {count} variants of {spec.name}; expected 1 to "
             f"{_MAX_VARIANTS}"
         )
+    null = NULL_SUFFIX if spec.role == "null" else ""
     for values in product(*axes.values()):
-        with located("--option"):
-            yield _typed(name, solver, dict(zip(axes, values, strict=True)))
+        options = {
+            key: _typed(f"{spec.name}: {key}", value, solver, key)
+            for key, value in zip(axes, values, strict=True)
+        }
+        label = f"{with_options(spec.label.removesuffix(null), options)}{null}"
+        variant = replace(spec, label=label, options={**spec.options, **options})
+        resolve(variant, registry)
+        yield variant
 
 
-def _typed(name: str, solver: Solver, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Convert the texts of options to the types of the solver's options.
+def _kinds(solver: Solver, key: str) -> tuple[Any, ...]:
+    """Return the types of the values of an option; None is one if it is the default."""
+    default = options_of(solver)[key]
+    kind = option_types(solver).get(key, type(default))
+    if kind is NoneType:
+        return _ANY
+    union = get_origin(kind) in (Union, UnionType)
+    return (*(get_args(kind) if union else (kind,)), *[NoneType] * (default is None))
 
-    name : name of the solver, for messages
+
+def _typed(where: str, value: Any, solver: Solver, key: str) -> Any:
+    """Convert a value, often a text, to the first type of the option that admits it."""
+    kinds = _kinds(solver, key)
+    if NoneType in kinds and value in (None, "none"):
+        return None
+    plain = value.item() if hasattr(value, "item") else value  # scalars of NumPy
+    for kind in kinds:
+        if _is_value(plain, (kind,), strict=False):
+            return msgspec.convert(plain, kind, strict=False)
+    names: list[str] = []
+    for kind in kinds:
+        choices = get_args(kind) if get_origin(kind) is Literal else ()
+        names += map(_text, choices) if choices else [kind.__name__]
+    raise InputError(f"{where} = {shown(value)}; expected {in_words(names)}")
+
+
+def _is_value(value: object, kinds: Iterable[Any], *, strict: bool = True) -> bool:
+    """Return True if one of the types admits a value."""
+    for kind in kinds:
+        try:
+            msgspec.convert(value, kind, strict=strict)
+        except (msgspec.ValidationError, TypeError):  # TypeError: a class of a plug-in
+            continue
+        return True
+    return False
+
+
+def in_words(names: Iterable[str]) -> str:
+    """Return the names of types as words for a message.
+
+    >>> in_words(["int", "NoneType"])
+    'an integer or none'
+
     """
-    defaults, annotated = options_of(solver), option_types(solver)
-    values = {}
-    for key, text in texts.items():
-        if key not in defaults:
-            raise unknown("option", key, defaults, where=name)
-        kind = annotated.get(key, type(defaults[key]))
-        if kind is NoneType:  # without an annotation, a default of None has no type
-            kind = bool | int | float | str
-        readings = [*_readings(text, kind, defaults[key])]
-        if not readings:
-            expected = " or ".join(dict.fromkeys(_expected(kind, defaults[key])))
-            raise InputError(f"{name}: {key} = {shown(text)}; expected {expected}")
-        values[key] = readings[0]
-    return values
+    return " or ".join(dict.fromkeys(_WORDS.get(name, name) for name in names))
 
 
 def with_options(label: str, options: Mapping[str, Any]) -> str:
@@ -222,54 +288,12 @@ def without_options(label: str) -> Iterator[str]:
 
 
 def _text(value: object) -> str:
-    """Return a value as a text without blanks, which `_readings` converts back."""
+    """Return a value as a text without blanks, since labels are split at blanks."""
     match value:
         case None | bool():
             return str(value).lower()
-        case str():  # replace blanks, since `without_options` splits labels at blanks
-            return "_".join(value.split())
-        case Integral():  # includes integers of NumPy
+        case Integral():
             return repr(int(value))
         case Real():
             return repr(float(value))
-    return repr(value)
-
-
-def _readings(text: str, kind: Any, default: object) -> Iterator[Any]:
-    """Yield the values of type `kind` that a text may represent.
-
-    default : default of the option; if it is None, "none" represents None
-    """
-    if text == "none" and default is None:
-        yield None
-    if get_origin(kind) in (Union, UnionType):
-        for part in get_args(kind):
-            yield from _readings(text, part, ...)
-    elif get_origin(kind) is Literal:
-        yield from (value for value in get_args(kind) if text == _text(value))
-    elif kind is bool:
-        yield from (value for word, value in _TRUTH.items() if word == text.lower())
-    elif kind in _NUMBERS:
-        if _NUMBERS[kind][0].fullmatch(text):
-            yield kind(text)
-    elif kind is str:
-        yield text
-
-
-def _expected(kind: Any, default: object) -> Iterator[str]:
-    """Yield descriptions of the values that an option may have, for messages."""
-    if get_origin(kind) in (Union, UnionType):
-        for part in get_args(kind):
-            yield from _expected(part, ...)
-    elif get_origin(kind) is Literal:
-        yield from map(_text, get_args(kind))
-    elif kind is bool:
-        yield from _TRUTH
-    elif kind in _NUMBERS:
-        yield _NUMBERS[kind][1]
-    elif kind is str:
-        yield "a string"
-    elif kind is not NoneType:
-        yield "a value that only a suite can contain, as `options` of a solver"
-    if default is None:
-        yield "none"
+    return "_".join(str(value).split())

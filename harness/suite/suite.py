@@ -5,58 +5,75 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from mortarbench.harness import checked
+import msgspec
+from msgspec import Meta, Struct
+
+from mortarbench.harness.checked import located
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, read_toml, toml
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.registry import SolverSpec, resolve
-from mortarbench.harness.suite.parameter_grid import Growth, expand_problems
+from mortarbench.harness.suite.parameter_grid import Problem, Text, expand_problems
+from mortarbench.harness.suite.solver_options import NULL_SUFFIX, grid, in_words
 
-DEFAULTS: Mapping[str, Any] = {
-    "tolerances": [1e-6],
-    "repeats": 3,
-    "time_limit": 60,
-    "memory_limit": 4096,
-    "accuracy": None,
-    "null_arm": None,
-    "ranks": [1],
-    "max_cases": 100_000,
-}
-_SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
-_NAME = re.compile(r"[\w.-]*\w[\w.-]*")
-_SOLVER_KEYS = ("name", "label", "options")
-#: End of the label of the second copy of a solver in an A/A comparison (``null_arm``).
-NULL_SUFFIX = " (A/A)"
+Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
+Fraction = Annotated[float, Meta(gt=0, lt=1)]
 
 
-def _between(key: str, value: Any) -> float | None:
-    """Check that `value` is None or strictly between 0 and 1, and return it."""
-    if value is None:
-        return None
-    if not checked.is_number(value) or not 0 < value < 1:
-        raise InputError(f"{key} = {shown(value)}; expected a number between 0 and 1")
-    return float(value)
+class Entry(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True
+):
+    """Table in ``solvers`` of a suite."""
+
+    name: Text  #: name in the registry
+    label: Text | None = None  #: None for the name
+    options: dict[str, Any] = {}  #: value of each option, or list of its values
 
 
-#: Functions that check the values of keys with a number.
-_NUMBERS: Mapping[str, Callable[[str, Any], float | None]] = {
-    "repeats": checked.at_least_one,
-    "time_limit": checked.positive,
-    "memory_limit": checked.positive,
-    "accuracy": _between,
-}
+class SuiteFile(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True
+):
+    """Content of a suite, of which only types and ranges have been checked."""
 
+    name: Annotated[str, Meta(pattern=r"^[\w.-]*\w[\w.-]*$")]
+    tolerances: Annotated[tuple[Fraction, ...], Meta(min_length=1)] = (1e-6,)
+    repeats: Annotated[int, Meta(ge=1, le=1_000_000)] = 3
+    time_limit: Positive = 60.0  #: s per measurement
+    memory_limit: Positive = 4096.0  #: MiB per measurement
+    #: tolerance of the verdicts; None for the tolerance that is passed to the solver
+    accuracy: Fraction | None = None
+    null_arm: Text | None = None  #: label of the solver that is measured twice
+    ranks: Annotated[tuple[int, ...], Meta(min_length=1)] = (1,)
+    max_cases: Annotated[int, Meta(ge=1, le=10**9)] = 100_000
+    solvers: tuple[Text | Entry, ...] = ()
+    problems: tuple[Problem, ...] = ()
 
-def _most_cases(table: Mapping[str, Any]) -> int:
-    return checked.at_least_one("max_cases", table["max_cases"], most=10**9)
+    def __post_init__(self) -> None:
+        for key in ("tolerances", "ranks"):
+            values = getattr(self, key)
+            if len(set(values)) < len(values):
+                raise ValueError(f"{key} = {values}; expected distinct numbers")
+        labels = [spec.label for spec in self.specs()]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise ValueError(
+                    f"solvers: the label {label!r} is used twice; expected different "
+                    "labels"
+                )
+
+    def specs(self) -> Iterator[SolverSpec]:
+        """Yield the solvers; a list among the options of a solver is not expanded."""
+        for entry in self.solvers:
+            one = Entry(name=entry) if isinstance(entry, str) else entry
+            label = one.label or one.name
+            yield SolverSpec(name=one.name, label=label, options=one.options)
 
 
 class Group(NamedTuple):
@@ -80,8 +97,8 @@ class Suite:
     text: str  #: TOML text of the suite, including the limits that apply
     #: sequences, each a tuple of its steps in order
     sequences: tuple[tuple[CaseId, ...], ...] = ()
-    #: positions of cases in series of growing sizes, by name of the case
-    growing: Mapping[str, Growth] = field(default_factory=dict)
+    #: names of the cases along each list of a grid
+    lines: tuple[tuple[str, ...], ...] = ()
     #: tolerance of the verdicts; None for the tolerance that is passed to the solver
     accuracy: float | None = None
     every: frozenset[str] = frozenset()  #: names of all cases, regardless of ``--case``
@@ -133,90 +150,81 @@ def parse_suite(
         If a value is invalid; the message states the key and valid values.
 
     """
-    with checked.located(where):
-        table = {**DEFAULTS, **toml(text)}
-        checked.only_keys(table, _SUITE_KEYS)
-        for key in ("name", "solvers", "problems"):
-            if key not in table:
-                raise InputError(f"{key} is missing")
-        if not _NAME.fullmatch(checked.text("name", table["name"])):
-            raise InputError(
-                f"name = {shown(table['name'])} is not a valid folder name; "
-                "expected letters, digits, '.', '-' and '_'"
-            )
-        problems = expand_problems(
-            table["problems"], families, folder, _most_cases(table)
-        )
-        numbers: dict[str, Any] = {
-            key: check(key, table[key]) for key, check in _NUMBERS.items()
-        }
-        specs = _solvers(table["solvers"], solvers)
-        cases, sequences = problems.cold, problems.sequences
-        specs = _on_ranks(specs, table, solvers)
-        every = frozenset(case.name for group in (cases, *sequences) for case in group)
+    with located(where):
+        file = suite_file(toml(text))
+        for key in ("solvers", "problems"):
+            if not getattr(file, key):
+                raise InputError(f"{key} is missing or empty; expected a list")
+        cases = expand_problems(file.problems, families, folder, file.max_cases)
+        groups = (cases.cold, *cases.sequences)
         return Suite(
-            name=table["name"],
-            tolerances=_tolerances(table["tolerances"]),
+            name=file.name,
+            tolerances=file.tolerances,
+            repeats=file.repeats,
+            time_limit=file.time_limit,
+            memory_limit=file.memory_limit,
+            accuracy=file.accuracy,
             text=text,
-            solvers=_with_null(specs, table["null_arm"]),
-            cases=cases,
-            every=every,
-            sequences=sequences,
-            growing=problems.growing,
-            **numbers,
+            solvers=_solvers(file, solvers),
+            cases=cases.cold,
+            sequences=cases.sequences,
+            lines=cases.lines,
+            every=frozenset(case.name for group in groups for case in group),
         )
 
 
-def name_in(text: str) -> str:
-    """Return the name in the TOML of a suite, or "" if it is missing or invalid."""
-    with suppress(InputError):
-        name = toml(text).get("name")
-        if isinstance(name, str) and _NAME.fullmatch(name):
-            return name
-    return ""
-
-
-def read_stored(path: Path) -> dict[str, Any]:
-    """Read the suite of a result folder, and check only the types of its values.
-
-    Names and ranges are not checked, since another version may have written the suite,
-    or the suite may need a plug-in.
+def suite_file(table: Mapping[str, Any]) -> SuiteFile:
+    """Check the keys, types and ranges of a suite, and return it.
 
     Raises
     ------
     InputError
-        If a value has the wrong type; the message states the file and the value.
+        If a key is unknown or missing, or if a value has the wrong type or is out of
+        range; the message states the path of the key, such as ``problems[0].forms``.
+
+    """
+    try:
+        return msgspec.convert(table, SuiteFile)
+    except msgspec.ValidationError as e:
+        message, _, path = str(e).partition(" - at `$")
+    path = path.removeprefix(".").removesuffix("`")
+    quoted = re.findall("`(.+?)`", message)
+    if message.startswith("Object contains unknown field"):
+        kind = {"": SuiteFile, "s": Entry, "p": Problem}[path[:1]]
+        raise unknown("key", quoted[0], kind.__struct_fields__, where=path)
+    if message.startswith("Object missing required field"):
+        raise InputError(f"{path}{': ' * bool(path)}{quoted[0]} is missing")
+    if not path:  # raised by `SuiteFile.__post_init__`
+        raise InputError(message)
+    value: Any = table
+    for name, index in re.findall(r"(\w+)|\[(\d+)\]", path):
+        value = value[name] if name else value[int(index)]
+    if "regex" in message:
+        message = "Expected a nonempty string without control characters"
+        if path == "name":
+            message = "Expected a folder name of letters, digits, '.', '-' and '_'"
+    expected = re.sub("`(.+?)`", lambda m: in_words(m[1].split(" | ")), message)
+    expected = expected.partition(", got ")[0].replace("Expected", "expected")
+    raise InputError(f"{path} = {shown(value)}; {expected}")
+
+
+def read_stored(path: Path) -> SuiteFile:
+    """Read the suite of a result folder, without looking up its cases and solvers.
+
+    Raises
+    ------
+    InputError
+        If a key or a value is invalid; the message states the file and the value.
 
     """
     table = read_toml(path, "the suite of a result folder")
     try:
-        for key in ("tolerances", "ranks"):
-            numbers = checked.any_list(key, table.get(key, []))
-            if not all(map(_is_finite, numbers)):
-                raise InputError(f"{key} = {shown(numbers)}; expected numbers")
-        for key in ("max_cases", *_NUMBERS):
-            if key in table and not _is_finite(table[key]):
-                raise InputError(f"{key} = {shown(table[key])}; expected a number")
-        for key in ("name", "null_arm"):
-            if key in table:
-                checked.text(key, table[key])
-        for i, entry in enumerate(
-            checked.any_list("solvers", table.get("solvers", []))
-        ):
-            with checked.located(f"solvers[{i}]"):
-                _spec(entry)
-        for block in checked.any_list("problems", table.get("problems", [])):
-            checked.table("problems", block, instead="tables")
+        return suite_file(table)
     except InputError as e:
         raise InputError(f"{path} is not a suite that a run wrote: {e}") from None
-    return table
 
 
-def _is_finite(value: Any) -> bool:
-    return checked.is_number(value) and abs(value) <= sys.float_info.max
-
-
-def suite_text(suite: Mapping[str, Any]) -> str:
+def as_toml(table: Mapping[str, Any]) -> str:
     """Return a suite as TOML, with one line per key.
 
     Raises
@@ -224,22 +232,22 @@ def suite_text(suite: Mapping[str, Any]) -> str:
     InputError
         If a value, such as None, cannot be written as TOML.
 
-    >>> print(suite_text({"name": "demo", "tolerances": [1e-6]}), end="")
+    >>> print(as_toml({"name": "demo", "tolerances": [1e-6]}), end="")
     name = "demo"
     tolerances = [1e-06]
 
     """
-    lines = [f"{_toml_key(k)} = {_toml_value(str(k), v)}" for k, v in suite.items()]
+    lines = [f"{_key(k)} = {_value(str(k), v)}" for k, v in table.items()]
     return "\n".join(lines) + "\n"
 
 
-def _toml_key(key: object) -> str:
+def _key(key: object) -> str:
     if not isinstance(key, str):
         raise InputError(f"key {shown(key)}; expected a string")
     return json.dumps(key) if re.search(r"[^\w-]|^$", key, re.ASCII) else key
 
 
-def _toml_value(where: str, value: Any) -> str:
+def _value(where: str, value: Any) -> str:
     """Return a value as TOML on one line; NumPy arrays and ranges become lists.
 
     where : path of the value, for messages
@@ -258,12 +266,11 @@ def _toml_value(where: str, value: Any) -> str:
             return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
         case Mapping():
             pairs = [
-                f"{_toml_key(k)} = {_toml_value(f'{where}.{k}', v)}"
-                for k, v in value.items()
+                f"{_key(k)} = {_value(f'{where}.{k}', v)}" for k, v in value.items()
             ]
             return f"{{ {', '.join(pairs)} }}" if pairs else "{}"
         case list() | tuple() | range():
-            entries = [_toml_value(f"{where}[{i}]", v) for i, v in enumerate(value)]
+            entries = [_value(f"{where}[{i}]", v) for i, v in enumerate(value)]
             return f"[{', '.join(entries)}]"
     raise InputError(
         f"{where} = {shown(value)}; expected a string, a number, true or false, a "
@@ -271,22 +278,10 @@ def _toml_value(where: str, value: Any) -> str:
     )
 
 
-def solvers_by_label(text: str) -> dict[str, SolverSpec]:
-    """Return the specs of the solvers in the TOML of a suite by label.
-
-    The names and options are not looked up in a registry.
-    """
-    table = toml(text)
-    specs = tuple(map(_spec, checked.filled_list("solvers", table.get("solvers"))))
-    return {spec.label: spec for spec in _with_null(specs, table.get("null_arm"))}
-
-
 def steps_up_to(
-    text: str, name: CaseId, families: Mapping[str, Family]
+    file: SuiteFile, name: CaseId, families: Mapping[str, Family]
 ) -> tuple[CaseId, ...]:
     """Return the steps of a sequence from its first case to the case `name`, inclusive.
-
-    text : TOML of the suite
 
     Raises
     ------
@@ -294,65 +289,43 @@ def steps_up_to(
         If no sequence contains the case.
 
     """
-    table = {**DEFAULTS, **toml(text)}
-    problems = expand_problems(
-        table.get("problems"), families, Path(), _most_cases(table)
-    )
-    for steps in problems.sequences:
+    cases = expand_problems(file.problems, families, Path(), file.max_cases)
+    for steps in cases.sequences:
         if name in steps:
             return steps[: steps.index(name) + 1]
     raise InputError("the suite has no sequence with that case")
 
 
-def limits(text: str) -> tuple[float, float]:
-    """Return the time limit in s and the memory limit in MiB from a suite's TOML."""
-    table = {**DEFAULTS, **toml(text)}
-    time_limit, memory_limit = (
-        checked.positive(key, table[key]) for key in ("time_limit", "memory_limit")
-    )
-    return time_limit, memory_limit
-
-
-def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:
-    specs: dict[str, SolverSpec] = {}
-    for i, entry in enumerate(checked.filled_list("solvers", entries)):
-        with checked.located(f"solvers[{i}]"):
-            spec = _spec(entry)
-            if spec.label in specs:
-                raise InputError(
-                    f"label {shown(spec.label)} is used twice; expected different "
-                    "labels"
-                )
-            resolve(spec, registry)
-        specs[spec.label] = spec
-    return tuple(specs.values())
-
-
-def _on_ranks(
-    specs: tuple[SolverSpec, ...],
-    table: Mapping[str, Any],
-    registry: Mapping[str, Solver],
-) -> tuple[SolverSpec, ...]:
-    """Return specs of each solver for every number of ranks in the suite.
+def _solvers(file: SuiteFile, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:
+    """Return the solvers of a suite on each number of ranks, with distinct labels.
 
     A solver that needs the entries of P is returned for a single rank: ranks apply P
     together, but do not assemble it.
     """
-    ranks = checked.filled_list("ranks", table["ranks"])
-    counts = [ranks_asked(n, "ranks") for n in ranks]
-    if len(set(counts)) < len(counts):
-        raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
-    if counts == [1]:
-        return specs
-    able = {s.label: _accepts_operators(resolve(s, registry)) for s in specs}
-    if not any(able.values()):
+    specs: dict[str, SolverSpec] = {}
+    counts = [ranks_asked(n, "ranks") for n in file.ranks]
+    for number, entry in enumerate(file.specs()):
+        with located(f"solvers[{number}]"):
+            for spec in grid(entry, registry):
+                able = counts == [1] or _accepts_operators(resolve(spec, registry))
+                for one in map(spec.on, counts if able else [1]):
+                    if one.label in specs:
+                        raise InputError(
+                            f"label {shown(one.label)} is used twice; expected "
+                            "different labels"
+                        )
+                    specs[one.label] = one
+    if max(counts) > 1 and all(spec.ranks == 1 for spec in specs.values()):
         raise InputError(
             f"ranks = {shown(counts)}: every solver needs the entries of P; expected "
             "one that needs products only, or no ranks"
         )
-    return tuple(
-        spec.on(n) for spec in specs for n in (counts if able[spec.label] else [1])
-    )
+    if file.null_arm is not None:
+        if file.null_arm not in specs:
+            raise unknown("null_arm", file.null_arm, specs)
+        label = f"{file.null_arm}{NULL_SUFFIX}"
+        specs[label] = replace(specs[file.null_arm], label=label, role="null")
+    return tuple(specs.values())
 
 
 def _accepts_operators(solver: Solver) -> bool:
@@ -364,40 +337,3 @@ def _accepts_operators(solver: Solver) -> bool:
 
     tiny = QP.from_arrays(np.eye(2), np.zeros(2), lb=np.zeros(2))
     return solver.declines(replace(tiny, P=aslinearoperator(np.eye(2)))) is None
-
-
-def _spec(entry: object) -> SolverSpec:
-    if isinstance(entry, str):
-        return SolverSpec(name=entry, label=entry)
-    table = checked.table("entry", entry, instead="a name or a table")
-    checked.only_keys(table, _SOLVER_KEYS)
-    if "name" not in table:
-        raise InputError("name is missing")
-    name = checked.text("name", table["name"])
-    return SolverSpec(
-        name=name,
-        label=checked.text("label", table.get("label", name)),
-        options=checked.table("options", table.get("options", {})),
-    )
-
-
-def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec, ...]:
-    """Append a second copy of the solver with this label, for an A/A comparison."""
-    if label is None:
-        return specs
-    by_label = {spec.label: spec for spec in specs}
-    if (label := checked.text("null_arm", label)) not in by_label:
-        raise unknown("null_arm", label, by_label)
-    copy = replace(by_label[label], label=f"{label}{NULL_SUFFIX}", role="null")
-    return (*specs, copy)
-
-
-def _tolerances(value: object) -> tuple[float, ...]:
-    numbers = checked.filled_list("tolerances", value)
-    if not all(checked.is_number(n) and 0 < n < 1 for n in numbers) or len(
-        set(numbers)
-    ) < len(numbers):
-        raise InputError(
-            f"tolerances = {shown(value)}; expected distinct numbers between 0 and 1"
-        )
-    return tuple(map(float, numbers))

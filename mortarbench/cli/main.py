@@ -301,8 +301,8 @@ _COMMANDS = {
                 _SEVERAL,
             ),
             _option(
-                "set an option of every solver that has it; with several values, as in "
-                "max_iter=50,100, every value is measured"
+                "set an option of every solver that has it, or of one by SOLVER.KEY; "
+                "if it is set several times, every value is measured"
             ),
             _PLUGIN,
             _Option(

@@ -2,8 +2,7 @@
 
 A *route* is a form of the QP with its decomposition and number of ranks, solved by the
 fastest of the measured solvers. The primal form with multigrid is a separate route.
-Cases of a growing series are built anew for each repeat; hence the time includes all
-work from the mesh to the recovered displacements:
+The time includes all work from the mesh to the recovered displacements:
 
     build (mesh, assembly, contact rows, dualisation) + prepare + solve + recovery.
 """
@@ -122,31 +121,18 @@ def charged(o: Outcome) -> Interval | None:
 
 
 def memory(o: Outcome) -> Interval | None:
-    """Return the median peak memory (MiB) of building and solving, with its interval.
+    """Return the median peak memory (MiB) of the solves, with its interval.
 
-    Building and solving take place in successive processes, so the larger of their
-    peaks counts. On several ranks, the ranks build the case themselves, and the peak is
-    the joint memory of all ranks. The value is None if no peak of the solves is known.
+    On several ranks, the ranks build the case themselves, and the peak is the joint
+    memory of all ranks. The value is None if no peak is known.
     """
-    peaks = [
-        max(r.build_peak_mib or 0.0, r.peak_mib)
-        for r in o.records
-        if r.peak_mib is not None
-    ]
+    peaks = [r.peak_mib for r in o.records if r.peak_mib is not None]
     return median_interval(peaks) if peaks else None
 
 
 def crossover_maps(evidence: Evidence) -> list[Map]:
-    """Return a map for each series of three or more sizes, measured with fresh builds.
-
-    A build is fresh if each repeat builds the case anew.
-    """
-    fresh = {r.family for r in evidence.records if r.build_peak_mib is not None}
-    answers = [
-        o
-        for o in evidence.flat
-        if o.first.family in fresh and not o.first.role and o.first.mode == "cold"
-    ]
+    """Return a map for each series of three or more sizes in primal and dual forms."""
+    answers = [o for o in evidence.flat if not o.first.role and o.first.mode == "cold"]
     dofs = _dofs(answers)
     sized = [(n, o) for o in answers if (n := dofs.get(_mesh(o))) is not None]
     fixed = fixed_keys(sized, apart=DECOMPOSITION)
@@ -157,7 +143,12 @@ def crossover_maps(evidence: Evidence) -> list[Map]:
         key = SeriesKey(r.family, shared, "", o.tol, "")
         series.setdefault(key, []).append((n, o))
     maps = (_map(key.title, of) for key, of in series.items())
-    return [one for one in maps if len(one.sizes) >= SIZES]
+    return [
+        one
+        for one in maps
+        if len(one.sizes) >= SIZES
+        and {route.kind in PRIMAL for route in one.routes} == {True, False}
+    ]
 
 
 def _map(title: str, sized: Sequence[tuple[int, Outcome]]) -> Map:

@@ -10,6 +10,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from msgspec import to_builtins
+
 from mortarbench.harness import InputError, Record, Verdict
 from mortarbench.harness.errors import say, some
 from mortarbench.harness.files.reading import read_json
@@ -296,7 +298,7 @@ def read_evidence(
         journal=journal,
         records=arrange(_judged_and_labelled(r, factor) for r in records),
         environment=environment,
-        suite=read_stored(suite) if os.path.lexists(suite) else {},
+        suite=to_builtins(read_stored(suite)) if os.path.lexists(suite) else {},
         factor=factor,
         faults=tuple(
             remaining_faults(read_faults(directory), {r.run_id for r in records})

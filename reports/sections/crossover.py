@@ -45,11 +45,11 @@ PARTS: dict[str, Callable[[Record], float]] = {
     11,
     "crossover",
     "From which size on does dualisation pay?",
-    "From which size on does dualisation pay?: no problems with growing = KEY and "
-    "three or more sizes (see suites/crossover.toml).",
+    "From which size on does dualisation pay?: no problem in "
+    "primal and dual forms at three or more sizes (see suites/crossover.toml).",
 )
 def crossover(a: Analysis) -> Iterator[Part]:
-    """Tabulate and draw all routes of every series measured with fresh builds."""
+    """Tabulate and draw all routes of every series of sizes."""
     maps = crossover_maps(a.evidence)
     if not maps:
         return

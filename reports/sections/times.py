@@ -12,7 +12,7 @@ from statistics import median
 from typing import NamedTuple
 
 from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
-from mortarbench.harness.suite.suite import NULL_SUFFIX
+from mortarbench.harness.suite.solver_options import NULL_SUFFIX
 from mortarbench.reports.data.cells import (
     case_cells,
     grid,

@@ -33,13 +33,12 @@ from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.results.faults import FAULTS
 from mortarbench.harness.results.folder import environment_of, refuse_other
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.suite.growth import as_toml
 from mortarbench.harness.suite.solver_options import (
-    options_as_texts,
+    listed_options,
     options_for,
     sweep,
 )
-from mortarbench.harness.suite.suite import load_suite, read_stored
+from mortarbench.harness.suite.suite import as_toml, load_suite, read_stored
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import assemble_stiffness
 from mortarbench.problems.models.description import read_bodies
@@ -350,7 +349,7 @@ def test_damaged_options_are_taken_or_refused(count):
             (key, value),
             lambda key=key, value=value: sweep(
                 [SolverSpec(name="osqp", label="osqp")],
-                options_as_texts({key: value} if isinstance(key, str) else value),
+                listed_options({key: value} if isinstance(key, str) else value),
                 SOLVERS,
             ),
         )

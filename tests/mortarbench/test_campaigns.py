@@ -184,7 +184,7 @@ def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
     ] * 2
     assert all(is_stored(tmp_path / "all", r.vectors) for r in held)
     assert read_toml(tmp_path / "all/suite.toml") == {
-        "name": "c", "solvers": ["exact", "lax", "liar"], "repeats": 2,
+        "name": "c", "tolerances": [1e-6], "solvers": ["exact", "lax", "liar"], "repeats": 2,
         "problems": [
             {"family": "well", "forms": ["dual"], "params": {"depth": [depth]}}
             for depth in (1, 2)
@@ -265,12 +265,12 @@ def test_a_measurement_of_two_sessions_is_replayed_by_session_and_run_id(
             "journal line of sch",
         ),
         (
-            lambda a, b: (b / "suite.toml").write_text("time_limit = 5\n"),
+            lambda a, b: (b / "suite.toml").write_text('name = "b"\ntime_limit = 5\n'),
             r"time_limit is 60 in .*a, 5 in .*b; expected equal settings",
         ),
         (
             lambda a, b: (b / "suite.toml").write_text(
-                'solvers = [{ name = "lax", label = "exact" }]\n'
+                'name = "b"\nsolvers = [{ name = "lax", label = "exact" }]\n'
             ),
             "label 'exact' is {'name': 'exact'} in .* expected labels to denote",
         ),

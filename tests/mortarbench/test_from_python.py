@@ -444,7 +444,7 @@ def test_a_suite_may_be_a_dict(results):
         ({"name": "a", "problem": []}, "suite: unknown key 'problem'; did you mean"),
         (
             {"name": 'a"\nb', "solvers": ["osqp"], "problems": []},
-            "suite: name = .* without control characters",
+            "suite: name = .* expected a folder name",
         ),
     ],
 )

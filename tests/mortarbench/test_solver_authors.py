@@ -130,7 +130,7 @@ def test_the_error_for_versions_without_labels_mentions_labels(cli, versions):
 
 
 def test_options_of_the_command_line_are_swept_and_measured_again(cli, versions):
-    sweep = ("--solver", "new:mine", "--option", "factor=1,2")
+    sweep = ("--solver", "new:mine", "--option", "factor=1", "--option", "factor=2")
     code, _, err = cli("run", "mine.toml", *versions, *sweep)
     records = {r.solver: r for r in read_journal(Path("out/mine"))}
 

@@ -67,18 +67,3 @@ def test_a_case_that_takes_long_is_not_built_twice(build, monkeypatch):
     monkeypatch.setattr(case_worker, "MAX_WARM_UP_SECONDS", 0.02)
     assert build("dual", n=2) == 0.01
     assert build.family.built == ["dual"]
-
-
-def test_after_another_case_a_case_is_built_once_and_its_memory_is_reported(tmp_path):
-    family = Slow()
-    worker = CaseWorker({"slow": family}, lambda _: None)
-    case = {"family": "slow", "params": {"n": 3}, "form": "dual", "name": "slow/dual"}
-    first = {**case, "params": {"n": 1}, "name": "slow/n=1/dual"}
-    request = {"build": case, "first": first, "qp": str(tmp_path / "a"), "keep": 1}
-
-    meta = worker.answer(request)["meta"]
-
-    assert family.built == ["dual", "dual"]
-    # time of the case with n = 3, not of the first case
-    assert meta["build_seconds"] >= 0.05
-    assert meta["build_peak_mib"] > 10

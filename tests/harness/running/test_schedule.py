@@ -1,5 +1,6 @@
 """Schedule of blocks: order and resumption."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,6 @@ from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.running.pairs import paired_ratio
 from mortarbench.harness.running.schedule import Schedule
-from mortarbench.harness.suite.parameter_grid import Growth
 from mortarbench.harness.suite.suite import Suite
 
 
@@ -153,29 +153,50 @@ def test_only_common_blocks_are_compared():
     assert paired_ratio({0: 1.0}, {0: 1.0}) is None
 
 
-def test_the_first_answer_that_is_not_verified_ends_a_growing_series():
-    """Solver a ends at n = 2 in its first repeat; b declines n = 1 and continues."""
-    small, middle, large = cases = cases_of(1, 2, 3)
-    growing = {
-        small.name: Growth("", small),
-        middle.name: Growth(small.name, small),
-        large.name: Growth(middle.name, small),
-    }
-    verdicts = {
-        ("a", middle.name): Verdict.TIME_LIMIT, ("b", small.name): Verdict.DECLINED
-    }  # fmt: skip
-    schedule = schedule_of(cases=cases, growing=growing)
-    made = []
-    for block in schedule.blocks():
-        assert block.warm_up["name"] == small.name
-        for (record,) in block.turns:
-            verdict = verdicts.get((record.solver, record.case), Verdict.VERIFIED)
-            made.append((record.solver, record.case, record.repeat))
-            schedule.add(record.replace(verdict=verdict))
+@pytest.mark.parametrize(
+    ("sizes", "last"), [((10, 20, 30, 40), 0), ((10, 10, 10, 10), 3), ((20, 10, 5), 3)]
+)
+def test_beyond_a_limit_only_larger_cases_are_skipped(sizes, last):
+    """Solver a hits the time limit at n = 2; b hits an iteration limit.
 
-    count = {(s, c.name): sum(m[:2] == (s, c.name) for m in made)
-             for s in "ab" for c in cases}  # fmt: skip
-    assert count == {
-        ("a", small.name): 3, ("a", middle.name): 1, ("a", large.name): 0,
-        ("b", small.name): 1, ("b", middle.name): 3, ("b", large.name): 3,
-    }  # fmt: skip
+    sizes : number of variables of the cases n = 1, 2, …
+    last : number of measurements of a at each n > 2
+    """
+    cases = cases_of(*range(1, len(sizes) + 1))
+    names = [case.name for case in cases]
+    schedule = schedule_of(cases=cases, lines=(tuple(names),))
+    made = Counter()
+    for block in schedule.blocks():
+        for (record,) in block.turns:
+            n = names.index(record.case) + 1
+            verdict = Verdict.ITERATION_LIMIT
+            if record.solver == "a":
+                verdict = Verdict.TIME_LIMIT if n == 2 else Verdict.VERIFIED
+            made[record.solver, n] += 1
+            filled = {"variables": sizes[n - 1]}
+            schedule.add(record.replace(verdict=verdict, sizes=filled))
+
+    assert [made["b", n + 1] for n in range(len(sizes))] == [3] * len(sizes)
+    assert [made["a", n + 1] for n in range(len(sizes))] == [
+        3, 3, *[last] * (len(sizes) - 2)
+    ]  # fmt: skip
+
+
+def test_a_limit_at_one_setting_does_not_skip_another_setting():
+    """The lines n = 1, 2, 3 of two settings are independent, as are tolerances."""
+    cases = cases_of(1, 2, 3, 4, 5, 6)
+    names = [case.name for case in cases]
+    schedule = schedule_of(
+        cases=cases, lines=(tuple(names[:3]), tuple(names[3:])), tolerances=(1e-3, 1e-6)
+    )
+    made = Counter()
+    for block in schedule.blocks():
+        for (record,) in block.turns:
+            n = names.index(record.case) + 1
+            at = (record.solver, n, record.tol)
+            verdict = Verdict.MEMORY_LIMIT if at == ("a", 2, 1e-6) else Verdict.VERIFIED
+            made[at] += 1
+            schedule.add(record.replace(verdict=verdict, sizes={"variables": n}))
+
+    assert [made["a", n, 1e-6] for n in range(1, 7)] == [3, 3, 0, 3, 3, 3]
+    assert [made["a", n, 1e-3] for n in range(1, 7)] == [3] * 6

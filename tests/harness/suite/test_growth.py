@@ -4,6 +4,7 @@ import pytest
 
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.suite.growth import incompatibility, unite
+from mortarbench.harness.suite.suite import suite_file
 
 SUITE = {
     "name": "s", "tolerances": [1e-6, 1e-8], "repeats": 3, "time_limit": 60,
@@ -24,7 +25,7 @@ SUITE = {
     ],
 )
 def test_an_extended_suite_counts_as_the_same_suite(more):
-    assert incompatibility(SUITE, SUITE | more) == ""
+    assert incompatibility(suite_file(SUITE), suite_file(SUITE | more)) == ""
 
 
 @pytest.mark.parametrize(
@@ -44,12 +45,12 @@ def test_an_extended_suite_counts_as_the_same_suite(more):
     ],
 )
 def test_settings_of_past_measurements_may_not_change(change, said):
-    assert incompatibility(SUITE, SUITE | change) == said
+    assert incompatibility(suite_file(SUITE), suite_file(SUITE | change)) == said
 
 
 def test_a_null_arm_may_not_be_removed():
-    with_copy = SUITE | {"null_arm": "a"}
-    assert incompatibility(with_copy, SUITE) == "null_arm was 'a', now not set"
+    with_copy, without = suite_file(SUITE | {"null_arm": "a"}), suite_file(SUITE)
+    assert incompatibility(with_copy, without) == "null_arm was 'a', now not set"
 
 
 def test_a_conflict_of_labels_names_the_two_folders_in_conflict():
@@ -60,4 +61,4 @@ def test_a_conflict_of_labels_names_the_two_folders_in_conflict():
         "c": {"solvers": [{"name": "clarabel", "label": "mine"}]},
     }
     with pytest.raises(InputError, match=r"'osqp'} in b, .*'clarabel'} in c;"):
-        unite(tables)
+        unite({k: suite_file({"name": "s", **v}) for k, v in tables.items()})

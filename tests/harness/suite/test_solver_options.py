@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
 from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.suite.solver_options import (
-    options_as_texts,
+    listed_options,
     options_for,
     parse_options,
     sweep,
@@ -78,22 +79,23 @@ def test_a_value_is_read_as_the_type_of_its_field(text, value):
             "max_itr=5",
             "--option: method: unknown option 'max_itr'; did you mean 'max_i",
         ),
-        ("max_iter=5.0", "--option: method: max_iter = '5.0'; expected an integer"),
+        ("max_iter=5.5", "--option: method: max_iter = '5.5'; expected an integer"),
         ("max_iter=1_0", "--option: method: max_iter = '1_0'; expected an integer"),
         ("max_iter=0", "--option: method: max_iter must be positive"),
         ("alpha=fast", "--option: method: alpha = 'fast'; expected a number"),
-        ("scaling=1", "--option: method: scaling = '1'; expected true or false"),
+        ("scaling=2", "--option: method: scaling = '2'; expected true or false"),
         ("mode=slow", "--option: method: mode = 'slow'; expected fast or exact"),
         ("seed=x", "--option: method: seed = 'x'; expected an integer or none"),
         (
             "shape=1",
-            "--option: method: shape = '1'; expected a value that only a suite can",
+            "--option: method: shape = '1'; expected tuple",
         ),
-        ("max_iter", "--option 'max_iter'; expected KEY=VALUE, such as max_iter=50"),
-        ("max_iter=", "--option 'max_iter='; expected KEY=VALUE"),
-        ("max_iter=5,", "--option 'max_iter=5,'; expected KEY=VALUE"),
-        ("=5", "--option '=5'; expected KEY=VALUE"),
-        ("max_iter=5,6", "--option: max_iter has 2 values; expected one value"),
+        ("max_iter", "--option 'max_iter'; expected [SOLVER.]KEY=VALUE, such as "),
+        ("max_iter=", "--option 'max_iter='; expected [SOLVER.]KEY=VALUE"),
+        ("=5", "--option '=5'; expected [SOLVER.]KEY=VALUE"),
+        (".max_iter=5", "--option '.max_iter=5'; expected [SOLVER.]KEY=VALUE"),
+        ("max_iter=5,6", "--option: method: max_iter = '5,6'; expected an integer"),
+        ("plain.steps=5", "--option: unknown solver 'plain'; known: method"),
     ],
 )
 def test_unknown_options_and_values_are_refused(text, message):
@@ -107,16 +109,24 @@ def labels(*texts, specs=SPECS):
     return [spec.label for spec in sweep(specs, parse_options(texts), SOLVERS)]
 
 
-def test_lists_span_a_grid_of_the_solvers_that_have_the_option():
-    """Values are a list or repeated options; a solver without the option is
-    unchanged.
-    """
-    assert labels("max_iter=5,6", "scaling=false") == [
+def test_repeated_options_span_a_grid_of_the_solvers_that_have_the_option():
+    """A solver without the option is unchanged."""
+    assert labels("max_iter=5", "max_iter=6", "scaling=false") == [
         "method max_iter=5 scaling=false", "method max_iter=6 scaling=false", "plain"
     ]  # fmt: skip
-    assert labels("max_iter=5", "max_iter=6") == labels("max_iter=5,6")
     assert labels("steps=1") == ["method", "plain steps=1"]
     assert labels() == ["method", "plain"]
+
+
+def test_an_option_may_be_set_for_one_label_or_name_only():
+    two = [SolverSpec(name="method", label="qpsolvers:a.b"), *SPECS]
+
+    assert labels("qpsolvers:a.b.max_iter=5", specs=two) == [
+        "qpsolvers:a.b max_iter=5", "method", "plain"
+    ]  # fmt: skip
+    assert labels("method.alpha=2", specs=two) == [
+        "qpsolvers:a.b alpha=2.0", "method alpha=2.0", "plain"
+    ]  # fmt: skip
 
 
 def test_labels_contain_the_value_in_canonical_form():
@@ -144,14 +154,15 @@ def test_a_null_arm_has_the_options_of_its_twin():
     ("texts", "message"),
     [
         (["max_itr=5"], "--option: unknown option 'max_itr'; did you mean 'max_iter'?"),
-        (["max_iter=5,5"], "--option: 'method max_iter=5' occurs twice"),
-        (["alpha=1,1.0"], "--option: 'method alpha=1.0' occurs twice"),
+        (["max_iter=5"] * 2, "--option: 'method max_iter=5' occurs twice"),
+        (["alpha=1", "alpha=1.0"], "--option: 'method alpha=1.0' occurs twice"),
+        (["plian.steps=5"], "--option: unknown solver 'plian'; did you mean 'plain'?"),
+        (["plain.max_iter=5"], "--option: plain: unknown option 'max_iter'; known:"),
         (["max_iter=0"], "--option: method: max_iter must be positive"),
-        (["mode=fast,slow"], "--option: method: mode = 'slow'; expected fast or exact"),
+        (["mode=fast", "mode=slow"], "--option: method: mode = 'slow'; expected fast"),
         (
-            [f"max_iter={','.join(map(str, range(1, 50)))}",
-             f"alpha={','.join(map(str, range(1, 50)))}"],
-            "--option spans 2401 variants of method; expected at most 1000",
+            [f"{key}={n}" for key in ("max_iter", "alpha") for n in range(1, 50)],
+            "--option: options span 2401 variants of method; expected 1 to 1000",
         ),
     ],
 )  # fmt: skip
@@ -163,11 +174,14 @@ def test_an_invalid_sweep_is_refused(texts, message):
 
 
 def test_options_of_a_program_are_those_of_the_command_line():
-    values = {"max_iter": [5, 6], "scaling": False, "mode": "exact", "seed": None}
+    values = {"max_iter": [5, np.int64(6)], "scaling": False, "mode": "exact"}
+    texts = ("max_iter=5", "max_iter=6", "scaling=false", "mode=exact")
 
-    assert options_as_texts(values) == parse_options(
-        ["max_iter=5,6", "scaling=false", "mode=exact", "seed=none"]
+    assert sweep(SPECS, listed_options(values), SOLVERS) == sweep(
+        SPECS, parse_options(texts), SOLVERS
     )
+    (null,) = sweep(SPECS[:1], listed_options({"seed": None}), SOLVERS)
+    assert null.options == {"seed": None}
 
 
 def test_the_label_of_the_suite_is_found_in_a_longer_one():
