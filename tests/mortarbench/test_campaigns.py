@@ -184,7 +184,8 @@ def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
     ] * 2
     assert all(is_stored(tmp_path / "all", r.vectors) for r in held)
     assert read_toml(tmp_path / "all/suite.toml") == {
-        "name": "c", "tolerances": [1e-6], "solvers": ["exact", "lax", "liar"], "repeats": 2,
+        "name": "c", "tolerances": [1e-6],
+        "solvers": ["exact", "lax", "liar"], "repeats": 2,
         "problems": [
             {"family": "well", "forms": ["dual"], "params": {"depth": [depth]}}
             for depth in (1, 2)
