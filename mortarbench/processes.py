@@ -1,4 +1,4 @@
-"""Main functions of the processes of a run: workers, MPI ranks and the case worker."""
+"""Main functions of the processes of a run: the worker, also on MPI ranks."""
 
 from __future__ import annotations
 
@@ -11,31 +11,33 @@ from mortarbench.harness.distributed.comm import Comm
 from mortarbench.harness.distributed.mpi import too_few_parts
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.plugin import CaseOnRanks
-from mortarbench.harness.processes.case_worker import CaseWorker
-from mortarbench.harness.processes.case_worker import serve as serve_cases
+from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.ranks import launch
 from mortarbench.harness.processes.solver_file import read_solver
-from mortarbench.harness.processes.worker import serve
+from mortarbench.harness.processes.worker import Worker, serve
 from mortarbench.harness.registry import SolverSpec, resolve, stand_for_harness
 from mortarbench.registries import Registries
 
 
 def worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Run a worker; called by the command that `Registries.worker_command` returns.
+    """Run a worker; called by the commands of `Registries`.
 
-    arguments : a JSON object, and the file descriptors for requests and replies
+    arguments : a JSON object, and the file descriptors for requests and replies. The
+        worker measures a solver if the object contains its ``name``
     """
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
     stand_for_harness()
     registries = registries.with_files(request["plugins"])
-    spec = SolverSpec(
-        name=request["name"], label=request["name"], options=request["options"]
-    )
-    solvers = registries.solvers
-    if "copy" in request:
-        solvers = {spec.name: read_solver(Path(request["copy"]))}
-    solver = resolve(spec, solvers)
+    families, solver = registries.families, None
+    if "folder" in request:
+        families = registries.families_with_copies(Path(request["folder"]))
+    if "name" in request:
+        name, solvers = request["name"], registries.solvers
+        if "copy" in request:
+            solvers = {name: read_solver(Path(request["copy"]))}
+        spec = SolverSpec(name=name, label=name, options=request["options"])
+        solver = resolve(spec, solvers)
 
     def build(case: Mapping[str, Any], comm: Comm) -> CaseOnRanks:
         from mortarbench.solvers.reference.operators import reference_of_operator
@@ -46,14 +48,13 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
             raise InputError(too_few_parts(1, comm.size))
         return on_ranks(comm, reference_of_operator)
 
-    is_parallel = request.get("ranks", 1) > 1
-    serve(
-        solver,
-        int(request_fd),
-        int(reply_fd),
-        registries.operators,
-        build if is_parallel else None,
+    work = Worker(
+        solver=solver,
+        cases=Cases(families, registries.reference),
+        operators=registries.operators,
     )
+    is_parallel = request.get("ranks", 1) > 1
+    serve(work, int(request_fd), int(reply_fd), build if is_parallel else None)
     return 0
 
 
@@ -64,23 +65,3 @@ def ranks(registries: Registries, arguments: Sequence[str]) -> int:
     """
     count = json.loads(arguments[0])["ranks"]
     return launch(count, [*registries.start, "worker", *arguments])
-
-
-def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Run the case worker; called by `case_worker` of `Registries.commands`.
-
-    arguments : a JSON object, and the file descriptors for requests and replies
-    """
-    text, request_fd, reply_fd = arguments
-    request = json.loads(text)
-    stand_for_harness()
-    registries = registries.with_files(request["plugins"])
-    families = registries.families
-    if "folder" in request:
-        families = registries.families_with_copies(Path(request["folder"]))
-    serve_cases(
-        CaseWorker(families, registries.reference, registries.operators),
-        int(request_fd),
-        int(reply_fd),
-    )
-    return 0

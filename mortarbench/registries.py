@@ -308,7 +308,7 @@ class Registries:
             request["folder"] = str(folder.absolute())
         return Commands(
             solvers={s.label: self.worker_command(s) for s in specs},
-            case_worker=[*self.start, "generator", json.dumps(request)],
+            case_worker=[*self.start, "worker", json.dumps(request)],
             own_code_only=self.hold_only_builtins(),
         )
 

@@ -25,81 +25,52 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 from enum import StrEnum
-from typing import Any, TextIO
+from typing import Any
 
+from mortarbench.harness.errors import one_line, shortened
 from mortarbench.harness.record import finite
 
 #: size of the largest reply that is read, which bounds the required memory
 MAX_REPLY_BYTES = 2**22
 MAX_EXCERPT_CHARACTERS = 200  #: longest excerpt of an invalid reply in a message
-MAX_FAULT_CHARACTERS = 2000  #: longest message of the event "fault"
 
-
-@dataclass(frozen=True)
-class Events:
-    """Callbacks with which the handler of a request sends events to the parent."""
-
-    start: Callable[[], None]  #: sends "start", at which the parent starts its clock
-    solved: Callable[[], None]  #: sends "solved": the first solve has ended
-    #: sends "timed": the worker's clock has stopped
-    timed: Callable[[], None]
-    #: sends "built" or "measured", with the entries of the event
-    reached: Callable[[str, Mapping[str, Any]], None]
-
-
-Handle = Callable[[dict[str, Any], Events], dict[str, Any]]
+#: sends an event, specified by its name and by its entries as keyword arguments
+Send = Callable[..., None]
 
 
 def answer_requests(
-    handle: Handle,
-    warm_up: Callable[[], dict[str, Any] | None],
+    answer: Callable[[dict[str, Any], Send], Mapping[str, Any]],
     request_fd: int,
     reply_fd: int,
 ) -> None:
     """Answer requests until the pipe of requests is closed.
 
-    handle : computes the answer to a request; called with the callbacks of its events
-    warm_up : performs the warm-up; returns further entries of the reply, or None
+    answer : returns the entries of the last event of a request; it sends the other
+        events
     """
     # Programs that a solver starts must neither keep the pipes open nor write to them.
     for fd in (request_fd, reply_fd):
         os.set_inheritable(fd, False)
     with os.fdopen(request_fd) as requests, os.fdopen(reply_fd, "w") as replies:
-        _send(replies, event="ready")
+
+        def send(event: str, **entries: Any) -> None:
+            reply = finite({"event": event, **entries})
+            replies.write(json.dumps(reply, allow_nan=False) + "\n")
+            replies.flush()
+
+        send("ready")
         while line := requests.readline():
             request = json.loads(line)
             try:
-                if "warm_up" in request:
-                    reply = {"event": "warm", **(warm_up() or {})}
-                else:
-                    answer = handle(request, _events(replies))
-                    reply = {"event": "done", **answer}
+                reply = answer(request, send)
                 sys.stdout.flush()  # the next request truncates the log
-            # fault of the harness: `handle` and `warm_up` catch errors of solvers
-            except Exception as e:
+            except Exception as e:  # fault of the harness, not of a solver
                 traceback.print_exc()
-                what = " ".join(f"{type(e).__name__}: {e}".split())
-                reply = {"event": "fault", "what": what[:MAX_FAULT_CHARACTERS]}
-            _send(replies, **reply)
-
-
-def _events(replies: TextIO) -> Events:
-    def reached(event: str, entries: Mapping[str, Any]) -> None:
-        _send(replies, event=event, **entries)
-
-    return Events(
-        lambda: _send(replies, event="start"),
-        lambda: _send(replies, event="solved"),
-        lambda: _send(replies, event="timed"),
-        reached,
-    )
-
-
-def _send(replies: TextIO, **event: Any) -> None:
-    replies.write(json.dumps(finite(event), allow_nan=False) + "\n")
-    replies.flush()
+                send("fault", what=one_line(f"{type(e).__name__}: {e}"))
+            else:
+                send("warm" if "warm_up" in request else "done", **reply)
 
 
 class ForeignReplyError(Exception):
@@ -115,23 +86,14 @@ def event_of(line: bytes, expected: str) -> dict[str, Any]:
         If the line is not one of these two events.
 
     """
-    try:
+    reply = None
+    with suppress(ValueError, RecursionError):
         reply = json.loads(line)
-    except ValueError:
-        raise ForeignReplyError(
-            f"{_excerpt(line)} was received, expected a reply"
-        ) from None
-    if not isinstance(reply, dict) or reply.get("event") not in (expected, "fault"):
-        raise ForeignReplyError(f"{_excerpt(line)} was received, expected {expected!r}")
-    return reply
-
-
-def _excerpt(line: bytes) -> str:
-    text = repr(line[: MAX_EXCERPT_CHARACTERS + 1].decode(errors="backslashreplace"))
-    return (
-        text
-        if len(line) <= MAX_EXCERPT_CHARACTERS
-        else f"{text[:MAX_EXCERPT_CHARACTERS]}…"
+    if isinstance(reply, dict) and reply.get("event") in (expected, "fault"):
+        return reply
+    text = repr(line[: 2 * MAX_EXCERPT_CHARACTERS].decode(errors="backslashreplace"))
+    raise ForeignReplyError(
+        f"{shortened(text, MAX_EXCERPT_CHARACTERS)} was received, expected {expected!r}"
     )
 
 

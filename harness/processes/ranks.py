@@ -20,9 +20,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from select import EPOLLIN, PIPE_BUF, epoll
+from select import EPOLLIN, epoll
 from typing import Any, Protocol
 
 import numpy as np
@@ -40,7 +39,7 @@ from mortarbench.harness.distributed.mpi import MISSING, mpiexec
 from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.plugin import Case, CaseOnRanks, Solver
-from mortarbench.harness.processes import reaper
+from mortarbench.harness.processes import parent
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.solution import Solution, Status
@@ -52,7 +51,7 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     """Run `command` on several MPI ranks, and report on stderr if a rank failed.
 
     A parent process of each rank records how the rank ended
-    (`harness.processes.reaper`). If one rank ends while others are running, the other
+    (`harness.processes.parent`). If one rank ends while others are running, the other
     ranks are ended, whatever the exit code. The message therefore names the rank that
     ended first. The output of the ranks is not parsed, since its lines may be
     interleaved.
@@ -69,13 +68,10 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     if start is None:
         print(f"{ranks} ranks: {MISSING}", file=sys.stderr)
         return 1
-    # Use all CPUs of this worker again: the supervisor bound this process to one CPU,
-    # and its parent, a sub-reaper, to the other CPUs.
-    with suppress(OSError):
-        usable = os.sched_getaffinity(os.getppid()) | os.sched_getaffinity(0)
-        os.sched_setaffinity(0, usable)
+    # Use all CPUs of the run again: the parent process bound only this process.
+    os.sched_setaffinity(0, os.sched_getaffinity(os.getppid()))
     read, write = os.pipe()
-    above = [sys.executable, "-I", "-S", reaper.__file__, "rank", str(write)]
+    above = [sys.executable, "-I", "-S", parent.__file__, "rank", str(write)]
     process = subprocess.Popen(
         [start, "-n", str(ranks), *above, *command],
         stdin=subprocess.DEVNULL,
@@ -89,10 +85,10 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     first = _RankExits(read, ranks).first(process.pid)
     code = process.poll()
     if code != 0 or first:
-        message = first or f"one of {ranks} ranks ended: mpiexec exited with {code}"
+        how = first or f"one of {ranks} ranks ended: mpiexec exited with {code}"
         # The parent quotes the last line of the output. The newline ends a possibly
         # unfinished line of a rank.
-        print(f"\n{message}", file=sys.stderr)
+        print(f"\n{how}", file=sys.stderr)
     return 0 if code == 0 else 1
 
 
@@ -101,22 +97,18 @@ class _RankExits:
 
     epoll(7) lists file descriptors in the order in which they became ready, even if the
     caller polls only after several of them are ready. This order identifies the rank
-    that ended first, whereas mpiexec names the lowest-numbered rank that has ended. The
-    parent process of a rank writes the exit status of the rank. The status is unknown
-    if the parent process was killed before it wrote the status.
+    that ended first, whereas mpiexec names the lowest-numbered rank that has ended.
+
+    record : pipe from which the records of the parent processes of ranks are read
     """
 
     def __init__(self, record: int, ranks: int) -> None:
-        os.set_blocking(record, False)
         self._record = record
         self._ranks = ranks
-        self._unread = b""
         self._rank_of: dict[int, int] = {}  # rank by pidfd of its process
-        # first rank that ended, or the message of its failure; None before any exit
-        self._first: int | str | None = None
-        self._exit_description: dict[int, str] = {}  # descriptions of exits by rank
+        self._first: list[int | str] = []  # ranks that ended, or messages of failures
+        self._ways: dict[int, str] = {}  # descriptions of exits by rank
         self._events = epoll()
-        self._events.register(record, EPOLLIN)
 
     def first(self, mpiexec: int) -> str:
         """Wait until mpiexec has ended; describe the exit of the first rank that ended.
@@ -126,67 +118,53 @@ class _RankExits:
 
         mpiexec : process ID
         """
-        mpi, deadline = os.pidfd_open(mpiexec), np.inf
-        self._events.register(mpi, EPOLLIN)
-        has_ended = False
-        while not has_ended and (left := deadline - time.monotonic()) > 0:
+        mpi, ready, deadline = os.pidfd_open(mpiexec), list[int](), np.inf
+        for fd in (self._record, mpi):
+            self._events.register(fd, EPOLLIN)
+        while mpi not in ready and (left := deadline - time.monotonic()) > 0:
             ready = [fd for fd, _ in self._events.poll(min(left, PEER_TIMEOUT))]
-            has_ended = mpi in ready
             for fd in ready:
                 if fd in self._rank_of:
-                    self._record_first(self._rank_of.pop(fd))
-                    os.close(fd)
+                    self._first.append(self._rank_of[fd])
+                    self._events.unregister(fd)
+                elif fd == mpi:  # ranks that end after mpiexec are ended by mpiexec
+                    self._first.append("")
                 else:
                     self._take_records()
-                if fd == mpi:  # ranks that end after mpiexec are ended by mpiexec
-                    self._record_first("")
-            if self._first is not None and deadline == np.inf:
+            if self._first and deadline == np.inf:
                 deadline = time.monotonic() + PEER_TIMEOUT
-        if self._first is None or isinstance(self._first, str):
-            return self._first or ""
-        one = f"rank {self._first}" if self._first >= 0 else "one"
-        way = self._exit_description.get(
-            self._first, "killed together with its parent process"
-        )
-        return f"{one} of {self._ranks} ranks ended: {way}"
+        if isinstance(rank := self._first[0], str):
+            return rank
+        way = self._ways.get(rank, "killed together with its parent process")
+        return f"rank {rank} of {self._ranks} ranks ended: {way}"
 
     def _take_records(self) -> None:
-        with suppress(BlockingIOError):
-            while chunk := os.read(self._record, 2**16):
-                *lines, self._unread = (self._unread + chunk).split(b"\n")
-                self._unread = self._unread[:PIPE_BUF]
-                for line in lines:
-                    with suppress(ValueError, KeyError, TypeError, OSError):
-                        self._take(json.loads(line))
-            with suppress(FileNotFoundError):  # end of file: all writers have ended
-                self._events.unregister(self._record)
-
-    def _take(self, line: Mapping[str, Any]) -> None:
-        if "failed" in line:
-            self._record_first(line["failed"])
-        elif "status" in line:
-            self._exit_description[line["rank"]] = _describe_exit(line["status"])
-        else:
-            for number in (line["process"], line["above"]):
+        """Read all records; each was written at once, so that no line is incomplete."""
+        lines = os.read(self._record, 2**16).splitlines()
+        if not lines:  # all writers have ended
+            self._events.unregister(self._record)
+        for line in map(json.loads, lines):
+            if "failed" in line:
+                self._first.append(line["failed"])
+            elif "status" in line:
+                self._ways[line["rank"]] = _describe_exit(line["status"])
+            else:
                 try:
-                    process = os.pidfd_open(number)
-                # the process of the rank ended before its record was read
-                except ProcessLookupError:
-                    self._record_first(line["rank"])
+                    process = os.pidfd_open(line["process"])
+                except ProcessLookupError:  # ended before its record was read
+                    self._first.append(line["rank"])
                 else:
                     self._rank_of[process] = line["rank"]
                     self._events.register(process, EPOLLIN)
 
-    def _record_first(self, first: int | str) -> None:
-        if self._first is None:
-            self._first = first
-
 
 def _describe_exit(status: int) -> str:
-    if os.WIFSIGNALED(status):
-        number = os.WTERMSIG(status)
-        return f"{signal.strsignal(number)} (signal {number})"
-    return f"exit code {os.waitstatus_to_exitcode(status)}"
+    code = os.waitstatus_to_exitcode(status)
+    return (
+        f"{signal.strsignal(-code)} (signal {-code})"
+        if code < 0
+        else f"exit code {code}"
+    )
 
 
 class Build(Protocol):

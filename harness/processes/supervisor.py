@@ -1,10 +1,11 @@
 """Supervision of a worker process: requests, limits and diagnosis of exits.
 
 Only SIGKILL to all processes of a worker stops every solver, because Python handles an
-alarm only after C code has returned, and some solvers ignore SIGTERM. A sub-reaper
-(`harness.processes.reaper`) above each worker keeps these processes in one tree. Memory
-is limited by polling the resident size, because RLIMIT_AS includes address space that
-libraries reserve and never touch. The module requires the /proc file system of Linux.
+alarm only after C code has returned, and some solvers ignore SIGTERM. A small parent
+process above each worker (`harness.processes.parent`) keeps these processes in one tree
+and kills them. Memory is limited by polling the resident size, because RLIMIT_AS
+includes address space that libraries reserve and never touch. The module requires the
+/proc file system of Linux.
 
 All workers of a process share one CPU. Requests from several threads are therefore
 serialised, and a worker that uses CPU time while it is idle is replaced, so that
@@ -26,7 +27,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from select import poll, select
+from select import select
 from typing import Any, ClassVar
 from weakref import WeakSet
 
@@ -34,8 +35,7 @@ import psutil
 
 from mortarbench.harness import limits
 from mortarbench.harness.environment.cpus import fastest_first
-from mortarbench.harness.limits import ONE_THREAD
-from mortarbench.harness.processes import reaper
+from mortarbench.harness.processes import parent
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.protocol import (
     MAX_REPLY_BYTES,
@@ -57,16 +57,14 @@ POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
 #: longest time between the closing of the pipe of requests and the exit of a worker,
 #: after which the worker is killed
 CLOSE_SECONDS = 1.0
-#: longest time between the end of all descendants of a sub-reaper and its own exit
-END_SECONDS = 1.0
 #: longest time for which idle threads of pools may spin after an answer
 SETTLE_SECONDS = 0.5
 #: CPU time of a worker between an answer and the next request, relative to wall time,
 #: above which the worker counts as busy
 MAX_IDLE_CPU_SHARE = 0.5
 #: largest CPU time, in s, between an answer and the next request that does not count as
-#: busy
-MIN_BUSY_CPU_SECONDS = 0.01
+#: busy; the kernel reports multiples of 0.01 s
+MIN_BUSY_CPU_SECONDS = 0.02
 LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
 #: length to which the last line of the log is shortened in a message
 MAX_LAST_LINE_CHARACTERS = 300
@@ -75,20 +73,13 @@ _MIN_FD = 3  #: smallest descriptor of a pipe; smaller numbers are standard stre
 #: fraction of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
 
-_LOCK = ForkSafeLock()  #: held while a thread starts, stops, ends or queries a worker
+_LOCK = ForkSafeLock()  #: held while a thread starts, ends or queries a worker
 
 REPLACEMENT_NOTE = "the worker used CPU time between measurements, and was replaced"
 
-_CPUCLOCK_SCHED = 2  #: bits of the ID of a CPU clock; see clock_getcpuclockid(3)
 #: Signals that solvers do not send to themselves. If such a signal ends a worker before
 #: a solve, the worker was killed from outside.
-_EXTERNAL_SIGNALS = {
-    signal.SIGKILL,
-    signal.SIGTERM,
-    signal.SIGINT,
-    signal.SIGHUP,
-    signal.SIGQUIT,
-}
+_EXTERNAL_SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT")
 #: last lines of output of processes that failed before a solve because of the machine
 _MACHINE_FAILURE = re.compile(
     r"No space left on device|Disk quota exceeded|Too many open files"
@@ -134,20 +125,19 @@ class WorkerProcess:
     def __init__(self, command: list[str], log: Path) -> None:
         self._command = command
         self._log = log
-        self._process: subprocess.Popen[bytes] | None = None  # the sub-reaper
+        self._process: subprocess.Popen[bytes] | None = None  # the worker's parent
         self._worker = 0  # process ID of the worker, once it is ready
-        self._reaper_fd = -1  # pidfd; -1 if there is no process
         # file descriptors of the two pipes in this process
         self._requests = self._replies = -1
-        self._unread = bytearray()
+        self._unread = b""
         self._warms_up = True
         self._is_warm = False
         # True between the steps of a sequence that several processes solve
         self._keeps_ranks = False
-        self._was_replaced = False  # True if the idle worker used CPU time
+        self._was_busy = False  # True if the worker used CPU time while it was idle
         # time on the parent's clock and CPU time of the worker at the last answer
         self._idle_since: tuple[float, float] | None = None
-        # number of threads and CPU of the worker; see `_facts`
+        # number of threads and CPU that the worker reports after its warm-up
         self._facts: dict[str, Any] = {}
         self._peak_mib = 0.0
         self._built: dict[str, Any] | None = None  # entries of the event "built"
@@ -184,45 +174,30 @@ class WorkerProcess:
         self._peak_mib, self._built = 0.0, None
         for worker in tuple(self._all):
             worker._end_if_busy()
-        notes = [REPLACEMENT_NOTE] * self._was_replaced
-        self._was_replaced = False
+        was_busy, self._was_busy = self._was_busy, False
         while True:
-            is_new = not self._is_warm
+            was_warm = self._is_warm
             try:
-                if is_new:
-                    self._start(memory_limit)
-                    self._is_warm = True
+                self._start(memory_limit)
                 answer, elapsed = self._exchange(request, time_limit, memory_limit)
                 break
             except _WorkerEndError as end:
                 self._kill()
-                if end.is_early and not is_new:
-                    continue
-                return self._reply_to_end(end, memory_limit)
+                if not (end.is_early and was_warm):
+                    return self._reply_to_end(end, memory_limit)
             except OSError as e:  # a process, pipe or log could not be created
                 self._kill()
                 return Reply(fault=True, message=one_line(e))
-        # copy these values, because `_kill` may reset them
-        peak = self._peak_mib or None
-        facts = self._facts
         self._keeps_ranks = "step" in request and source_of(request).is_shared
-        if (
-            self._others() and not self._keeps_ranks
-        ):  # remaining processes would disturb the next measurement
-            self._kill()
+        if not self._keeps_ranks and self._has_children():
+            self._kill()  # remaining processes would disturb the next measurement
         elif self._stays_busy():
             self._kill()
-            notes.append(REPLACEMENT_NOTE)
+            was_busy = True
         else:
             self._idle_since = (time.monotonic(), self._cpu_seconds())
-        return Reply(
-            answer=answer,
-            message="; ".join(dict.fromkeys(notes)),
-            elapsed_seconds=elapsed,
-            peak_mib=peak,
-            built=self._built,
-            **facts,
-        )
+        note = REPLACEMENT_NOTE if was_busy else ""
+        return self._reply(answer=answer, elapsed_seconds=elapsed, message=note)
 
     @_LOCK
     def close(self) -> None:
@@ -231,10 +206,11 @@ class WorkerProcess:
         The time limit is `CLOSE_SECONDS`.
         """
         try:
-            self._close("_requests")
-            deadline = time.monotonic() + CLOSE_SECONDS
-            while time.monotonic() < deadline and not self._is_dead():
-                time.sleep(POLL_SECONDS / 4)
+            if self._process is not None:
+                os.close(self._requests)
+                self._requests = -1
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(CLOSE_SECONDS)
         finally:
             self._kill()
 
@@ -242,57 +218,45 @@ class WorkerProcess:
     def forget_all(cls) -> None:
         """Disown all workers; called in a fork, since workers belong to the parent."""
         for worker in tuple(cls._all):
-            worker._disown()
+            worker._forget()
         cls._all.clear()
 
     def _exchange(
         self, request: Mapping[str, Any], time_limit: float, memory_limit: float
     ) -> tuple[dict[str, Any], float | None]:
+        """Send a request; return the answer, and the time to the event "timed"."""
         with suppress(OSError):
             self._log.write_bytes(b"")
-        sent = time.monotonic()
+        oom_kills, sent, elapsed = _oom_kills(), time.monotonic(), None
         self._send(request)
-        is_shared = source_of(request).is_shared
-        if is_shared:
-            self._built = self._await(
-                "built", time_limit, memory_limit, stage="build: "
-            )
-        self._await("start", START_SECONDS, memory_limit)
-        oom_kills = _oom_kills()
+        is_shared, is_timed = source_of(request).is_shared, measures(request)
+        final_limit, stage = time_limit, ""
         try:
-            elapsed = None
-            if measures(request):
+            if is_shared:
+                self._built = self._await("built", time_limit, memory_limit, "build: ")
+            self._await("start", START_SECONDS, memory_limit)
+            if is_timed:
                 self._await("solved", time_limit, memory_limit)
                 self._await("timed", REPEAT_SECONDS, memory_limit)
                 elapsed = time.monotonic() - sent
+                final_limit = max(time_limit, POINT_SECONDS)
             if is_shared:
                 self._await("measured", POINT_SECONDS, memory_limit)
-                peak = self._peak_mib  # exclude the memory of the evaluation
                 stage = "evaluation of the answer: "
-                limit = max(time_limit, POINT_SECONDS)
-                try:
-                    answer = self._await("done", limit, inf, stage=stage)
-                finally:
-                    self._peak_mib = peak
-            else:
-                limit = POINT_SECONDS if measures(request) else time_limit
-                answer = self._await("done", limit, memory_limit)
+            memory = None if is_shared else memory_limit
+            answer = self._await("done", final_limit, memory, stage)
         except _WorkerEndError as end:
-            end.is_oom = end.signal == signal.SIGKILL and _oom_kills() > oom_kills
+            end.is_oom = end.signal == "SIGKILL" and _oom_kills() > oom_kills
             raise
         self._trim_log()
         return answer, elapsed
 
     def _reply_to_end(self, end: _WorkerEndError, memory_limit: float) -> Reply:
         """Diagnose the end of a worker: a verdict on the solver, or a fault."""
-        peak, message, verdict = self._peak_mib or None, str(end), end.verdict
-        is_fault = end.is_fault or (
-            end.is_early
-            and (
-                end.signal in _EXTERNAL_SIGNALS
-                or _MACHINE_FAILURE.search(message) is not None
-            )
-        )
+        peak, message, verdict = self._peak_mib, str(end), end.verdict
+        from_outside = end.signal in _EXTERNAL_SIGNALS
+        has_failed = from_outside or _MACHINE_FAILURE.search(message) is not None
+        is_fault = end.is_fault or (end.is_early and has_failed)
         if out_of_memory(message, peak, memory_limit):
             verdict, is_fault = Verdict.MEMORY_LIMIT, False
         elif end.is_oom:
@@ -300,49 +264,49 @@ class WorkerProcess:
             verdict = Verdict.MEMORY_LIMIT
             # The process that the kernel kills need not be the cause. If the worker
             # used less than half of the available memory, the end counts as a fault.
-            is_fault = (peak or 0.0) < limits.memory_limit_mib() / 2
-        return Reply(
+            is_fault = peak < limits.memory_limit_mib() / 2
+        return self._reply(
             verdict=None if is_fault else verdict,
             fault=is_fault,
             message=message,
             in_repeats=end.event == "timed",
-            peak_mib=peak,
-            built=self._built,
-            **self._facts,
         )
 
+    def _reply(self, **entries: Any) -> Reply:
+        peak = self._peak_mib or None
+        return Reply(peak_mib=peak, built=self._built, **self._facts, **entries)
+
     def _start(self, memory_limit: float) -> None:
-        """Start the worker and run its warm-up.
+        """Start the worker and run its warm-up, unless it is warm already.
 
         If the solver causes the worker's death during the warm-up, the worker is
         restarted without a warm-up. If the worker was killed from outside, the warm-up
         is repeated once.
         """
-        if self._process is None:
-            self._spawn(memory_limit)
-        self._await_ready(memory_limit)
-        for is_last in (False, True):
-            if not self._warms_up:
-                return
+        is_first = True
+        while not self._is_warm:
+            if self._process is None:
+                self._spawn(memory_limit)
+            self._await("ready", START_SECONDS, memory_limit)
+            self._worker = next(iter(self._tree()), 0)
             try:
-                self._send({"warm_up": True})
-                self._facts = _facts(self._await("warm", WARM_UP_SECONDS, memory_limit))
-                return
+                if self._warms_up:
+                    self._send({"warm_up": True})
+                    facts = self._await("warm", WARM_UP_SECONDS, memory_limit)
+                    self._facts = {k: facts.get(k) for k in ("threads", "cpu")}
+                self._is_warm = True
             except _WorkerEndError as end:
                 if end.is_fault:
                     raise
-                self._warms_up = end.signal in _EXTERNAL_SIGNALS and not is_last
+                self._warms_up = end.signal in _EXTERNAL_SIGNALS and is_first
+                is_first = False
                 self._kill()
-                self._spawn(memory_limit)
-                self._await_ready(memory_limit)
 
     def _spawn(self, memory_limit: float) -> None:
-        cpu = fastest_first(os.sched_getaffinity(0))[0]
-        self._unread = bytearray()
-        their_requests, self._requests = _pipe()
-        self._replies, their_replies = _pipe()
-        pipes = (their_requests, their_replies)
-        environment = ONE_THREAD | {limits.VARIABLE: str(memory_limit)}
+        """Start the command below a small parent."""
+        limit = {limits.VARIABLE: str(memory_limit)}
+        requests, self._requests = _pipe()
+        self._replies, replies = _pipe()
         try:
             self._log.write_bytes(b"")
             # In append mode, the worker writes at the new end of the file after
@@ -351,47 +315,35 @@ class WorkerProcess:
             with self._log.open("ab") as log:
                 self._process = subprocess.Popen(
                     [
-                        sys.executable,
-                        "-I",
-                        "-S",
-                        reaper.__file__,
-                        str(cpu),
-                        *map(str, pipes),
+                        *(sys.executable, "-I", "-S", parent.__file__),
+                        str(os.getpid()),
+                        str(fastest_first(os.sched_getaffinity(0))[0]),
+                        str(requests),
+                        str(replies),
                         *self._command,
                     ],
-                    # if this process dies, the kernel closes the pipe, which ends the
-                    # tree
-                    stdin=subprocess.PIPE,
+                    stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
-                    env=os.environ | environment,
-                    pass_fds=pipes,
+                    env=os.environ | limits.ONE_THREAD | limit,
+                    pass_fds=(requests, replies),
                     start_new_session=True,
                 )
         finally:
-            os.close(their_requests)
-            os.close(their_replies)
-        self._reaper_fd = os.pidfd_open(self._process.pid)
-
-    def _await_ready(self, memory_limit: float) -> None:
-        assert self._process is not None
-        self._await("ready", START_SECONDS, memory_limit)
-        for worker in self._tree()[:1]:  # the tree lists a parent before its children
-            self._worker = worker
-        if not self._worker:
-            raise OSError(f"/proc lists no process below {self._process.pid}")
+            os.close(requests)
+            os.close(replies)
 
     def _send(self, request: Mapping[str, Any]) -> None:
         with suppress(BrokenPipeError):  # the worker has died; `_await` diagnoses why
             os.write(self._requests, (json.dumps(request) + "\n").encode())
 
     def _await(
-        self, event: str, limit: float, memory_limit: float, *, stage: str = ""
+        self, event: str, limit: float, memory_limit: float | None, stage: str = ""
     ) -> dict[str, Any]:
         """Wait for an event, and return its entries.
 
         limit : time limit, in s
-        memory_limit : memory limit, in MiB
+        memory_limit : memory limit, in MiB; None if the memory is not recorded
         stage : stage of the measurement, as a prefix of the error message
 
         Raises
@@ -401,199 +353,188 @@ class WorkerProcess:
 
         """
 
-        def ended(verdict: Verdict, how: str, *more: int) -> _WorkerEndError:
-            return _WorkerEndError(event, verdict, how, *more, stage=stage)
+        def ended(verdict: Verdict, how: str, name: str = "") -> _WorkerEndError:
+            return _WorkerEndError(event, verdict, how, name, stage)
 
         deadline = time.monotonic() + limit
-        while True:
+        while b"\n" not in self._unread:
             # Check before reading: the reply of a worker that dies afterwards still
             # counts.
-            dead = self._is_dead()
-            has_more = self._read(0 if dead else POLL_SECONDS)
-            line, newline, rest = self._unread.partition(b"\n")
-            if newline:
-                self._unread = rest
+            is_dead = self._is_dead()
+            chunk = self._read(0 if is_dead else POLL_SECONDS)
+            self._unread += chunk
+            if b"\n" in chunk:
                 break
-            if len(self._unread) > MAX_REPLY_BYTES:
-                most = MAX_REPLY_BYTES >> 20
-                how = f"more than {most} MiB were received without an end of line"
-                raise ended(Verdict.FAILED, how)
-            if dead and not has_more:
+            if is_dead and not chunk:
                 raise ended(Verdict.CRASHED, *self._death())
+            if len(self._unread) > MAX_REPLY_BYTES:
+                most = f"more than {MAX_REPLY_BYTES >> 20} MiB"
+                raise ended(
+                    Verdict.FAILED, f"{most} were received without an end of line"
+                )
             if time.monotonic() > deadline:
                 raise ended(Verdict.TIME_LIMIT, f"killed after {limit:g} s")
-            memory = _memory_mib(self._tree(), memory_limit)
-            self._peak_mib = max(self._peak_mib, memory)
-            if memory > memory_limit:
-                how = f"killed at {memory:.0f} MiB, above the limit of {memory_limit:g}"
-                raise ended(Verdict.MEMORY_LIMIT, f"{how} MiB")
+            if memory_limit is not None and (how := self._excess(memory_limit)):
+                raise ended(Verdict.MEMORY_LIMIT, how)
             self._trim_log()
+        line, _, self._unread = self._unread.partition(b"\n")
         try:
-            reply = event_of(bytes(line), event)
+            reply = event_of(line, event)
         except ForeignReplyError as e:
             raise ended(Verdict.FAILED, str(e)) from None
         if reply.pop("event") == "fault":
-            end = ended(Verdict.FAILED, one_line(reply["what"]))
+            end = ended(Verdict.FAILED, reply["what"])
             end.is_fault = True
             raise end
         return reply
+
+    def _excess(self, limit: float) -> str:
+        """Record the memory of the worker; return a message if it exceeds the limit."""
+        memory = _memory_mib(self._tree(), limit)
+        self._peak_mib = max(self._peak_mib, memory)
+        if memory <= limit:
+            return ""
+        return f"killed at {memory:.0f} MiB, above the limit of {limit:g} MiB"
+
+    def _read(self, timeout: float) -> bytes:
+        """Read replies of the worker, waiting at most `timeout` seconds."""
+        if not select([self._replies], [], [], timeout)[0]:
+            return b""
+        chunk = os.read(self._replies, 2**16)
+        # At end of file, the worker is dying, or its solver has closed all descriptors.
+        if not chunk:
+            time.sleep(timeout)
+        return chunk
 
     def _trim_log(self) -> None:
         with suppress(OSError):  # other code reports a deleted folder
             if self._log.stat().st_size > LOG_BYTES:
                 os.truncate(self._log, 0)
 
-    def _read(self, timeout: float) -> bool:
-        """Read replies of the worker, waiting at most `timeout` seconds.
-
-        Return True if a complete line is available, or new bytes were read.
-        """
-        if b"\n" in self._unread:  # a further reply was read together with the last one
-            return True
-        has_more = False
-        while select([self._replies], [], [], 0 if has_more else timeout)[0]:
-            chunk = os.read(self._replies, 2**16)
-            # At end of file, the worker is dying, or its solver has closed all
-            # descriptors.
-            if not chunk:
-                time.sleep(timeout)
-                break
-            self._unread += chunk
-            has_more = True
-            if b"\n" in chunk or len(self._unread) > MAX_REPLY_BYTES:
-                break
-        return has_more
+    def _is_dead(self) -> bool:
+        return self._process is None or self._process.poll() is not None
 
     def _tree(self) -> list[int]:
-        """List the worker and its descendants; empty if the sub-reaper has ended."""
-        if self._process is None:
-            return []
-        processes = reaper.descendants(self._process.pid)
-        # Check after the listing. If the sub-reaper has ended, another process may have
-        # reused its ID, and the listed descendants may belong to this other process.
-        return [] if self._is_dead() else processes
+        """List the worker and its descendants; empty if the worker's parent has ended.
 
-    def _others(self) -> list[int]:
-        return [process for process in self._tree() if process != self._worker]
+        psutil would read the status of every process of the machine.
+        """
+        if self._process is None or self._process.poll() is not None:
+            return []
+        return parent.descendants(self._process.pid)
+
+    def _has_children(self) -> bool:
+        """Return True if the worker has started processes that still exist."""
+        for number in {*self._tree()} - {self._worker}:
+            with suppress(psutil.Error):
+                if psutil.Process(number).status() != psutil.STATUS_ZOMBIE:
+                    return True
+        return False
 
     def _cpu_seconds(self) -> float:
-        """Return the CPU time, counted by the kernel, of all threads of the worker."""
-        with suppress(OSError):  # the worker may have ended
-            return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
+        """Return the CPU time of all threads of the worker."""
+        with suppress(psutil.Error):  # the worker may have ended
+            times = psutil.Process(self._worker).cpu_times()
+            return float(times.user + times.system)
         return 0.0
 
     def _end_if_busy(self) -> None:
         """Kill the worker if it has died, or used CPU time since its last answer."""
-        if self._process is not None and self._idle_since is not None:
-            self._was_replaced |= self._has_been_busy()
-            if self._was_replaced or self._is_dead():
-                self._kill()
-
-    def _has_been_busy(self) -> bool:
-        assert self._idle_since is not None
+        if self._idle_since is None:
+            return
         since, used = self._idle_since
         allowed = max(
             MIN_BUSY_CPU_SECONDS, MAX_IDLE_CPU_SHARE * (time.monotonic() - since)
         )
-        return self._cpu_seconds() - used > allowed
+        self._was_busy |= self._cpu_seconds() - used > allowed
+        if self._was_busy or self._is_dead():
+            self._kill()
 
     def _stays_busy(self) -> bool:
         """Return True if threads of the worker continue to compute after its answer.
 
-        Threads of pools may spin before they sleep, for at most `SETTLE_SECONDS`. The
-        decision depends on CPU time and not on the state "R", because on a busy machine
-        a thread that waits for a CPU also has this state.
+        Threads of pools may spin before they sleep, for at most `SETTLE_SECONDS`.
         """
-        deadline = time.monotonic() + SETTLE_SECONDS
-        pause, used = POLL_SECONDS / 100, self._cpu_seconds()
+        deadline, pause = time.monotonic() + SETTLE_SECONDS, POLL_SECONDS / 100
         while self._runs():
             if time.monotonic() > deadline:
-                return self._cpu_seconds() - used > MIN_BUSY_CPU_SECONDS
+                return True
             time.sleep(pause)
             pause = min(2 * pause, POLL_SECONDS)
         return False
 
     def _runs(self) -> bool:
-        with suppress(OSError):
-            tasks = os.listdir(f"/proc/{self._worker}/task")
-            return any(reaper.state(self._worker, int(t)) == "R" for t in tasks)
+        """Return True if a thread of the worker runs, or waits for a CPU."""
+        with suppress(psutil.Error):
+            threads = [t.id for t in psutil.Process(self._worker).threads()]
+            return "running" in [psutil.Process(t).status() for t in threads]
         return False
 
-    def _is_dead(self) -> bool:
-        """Return True if the sub-reaper has ended, or was not started.
-
-        A pidfd becomes and remains readable when its process ends, even if other code
-        of this program reaps the process; waitpid(2) would then fail.
-        """
-        if self._reaper_fd == -1:
-            return True
-        poller = poll()
-        poller.register(self._reaper_fd)
-        return bool(poller.poll(0))
-
-    def _death(self) -> tuple[str, int]:
-        """Describe a worker's end; return also the signal that ended it, or 0.
+    def _death(self) -> tuple[str, str]:
+        """Describe a worker's end; return also the signal that ended it, or "".
 
         The description includes the last line of the worker's output.
         """
-        how, number = (
-            (
-                "ended, but other code of this process reaped it, so that its "
-                "exit code is unknown"
-            ),
-            0,
-        )
-        with suppress(ChildProcessError):
-            how, number = _describe_exit(self._reaper_fd)
-        last = ""
+        assert self._process is not None
+        code, last = self._process.wait(), ""
+        names = {-s.value: s.name for s in signal.Signals}
+        name = names.get(code, f"signal {-code}") if code < 0 else ""
+        how = name or f"exit code {code}"
         with suppress(OSError), self._log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL_BYTES))
             text = file.read(_LOG_TAIL_BYTES).decode(errors="replace")
             last = text.strip().rpartition("\n")[2][-MAX_LAST_LINE_CHARACTERS:]
-        return (f"{how}: {last}" if last else how), number
+        return (f"{how}: {last}" if last else how), name
 
     def _kill(self) -> None:
         """Kill the worker and its descendants."""
         if self._process is not None:
-            if not self._is_dead():
-                reaper.kill_descendants(self._process.pid)
-            if self._process.stdin is not None:
-                # the sub-reaper reaps its children and exits
-                self._process.stdin.close()
+            # a solver may have stopped the parent of its worker
+            self._process.send_signal(signal.SIGCONT)
+            self._process.terminate()
             try:
-                self._process.wait(END_SECONDS)
-            # a solver may have sent SIGSTOP to the sub-reaper
+                self._process.wait(parent.END_SECONDS + 1.0)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
         self._forget()
 
-    def _disown(self) -> None:
-        """Close this fork's copies of a worker's file descriptors.
-
-        The worker belongs to the parent of the fork. If a copy stayed open, the worker
-        would survive the death of that parent.
-        """
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()
-        self._forget()
-
     def _forget(self) -> None:
-        self._process = None
-        self._is_warm = self._keeps_ranks = False
-        self._worker, self._idle_since = 0, None
-        for name in ("_replies", "_requests", "_reaper_fd"):
-            self._close(name)
-
-    def _close(self, name: str) -> None:
-        """Close a file descriptor and forget it, since its number may be used again."""
-        fd: int = getattr(self, name)
-        setattr(self, name, -1)
-        if fd != -1:
+        """Close the pipes, and forget the process and its state."""
+        for fd in {self._requests, self._replies} - {-1}:
             os.close(fd)
+        self._process, self._worker, self._idle_since = None, 0, None
+        self._requests = self._replies = -1
+        self._unread = b""
+        self._is_warm = self._keeps_ranks = False
 
 
 os.register_at_fork(after_in_child=WorkerProcess.forget_all)
+
+
+class _WorkerEndError(Exception):
+    """End of a worker before an expected event.
+
+    event : name of the expected event
+    verdict : verdict on the solver, if the solve had started
+    how : description of the end
+    name : signal that ended the worker, or ""
+    stage : prefix of the message
+    """
+
+    def __init__(
+        self, event: str, verdict: Verdict, how: str, name: str, stage: str
+    ) -> None:
+        self.event = event
+        self.is_early = event in ("ready", "warm", "start")
+        super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
+        if self.is_early and verdict is Verdict.TIME_LIMIT:
+            # the limit `START_SECONDS` has expired, not the limit of the suite
+            verdict = Verdict.FAILED
+        self.verdict = verdict
+        self.signal = name
+        self.is_fault = False  #: True if the worker reported a fault of the harness
+        self.is_oom = False  #: True if the kernel killed the worker for lack of memory
 
 
 def _memory_mib(tree: list[int], limit: float) -> float:
@@ -603,20 +544,16 @@ def _memory_mib(tree: list[int], limit: float) -> float:
     several processes exceeds `limit`, in MiB, the proportional set sizes are added
     instead, for which the kernel has to walk all page tables.
     """
-    processes = []
+    resident = proportional = 0
+    for number in tree:
+        with suppress(psutil.Error):  # the process has ended
+            resident += psutil.Process(number).memory_info().rss
+    if resident <= limit * 2**20 or len(tree) == 1:
+        return resident / 2**20
     for number in tree:
         with suppress(psutil.Error):
-            processes.append(psutil.Process(number))
-    total = 0
-    for process in processes:
-        with suppress(psutil.Error):
-            total += process.memory_info().rss
-    if total > limit * 2**20 and len(processes) > 1:
-        total = 0
-        for process in processes:
-            with suppress(psutil.Error):
-                total += process.memory_full_info().pss
-    return total / 2**20
+            proportional += psutil.Process(number).memory_full_info().pss
+    return proportional / 2**20
 
 
 def _pipe() -> tuple[int, int]:
@@ -626,65 +563,12 @@ def _pipe() -> tuple[int, int]:
     of this stream, and the standard streams of the worker would replace the pipe.
     """
     ends = os.pipe()
-    if min(ends) >= _MIN_FD:
-        return ends
     try:
         read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _MIN_FD) for e in ends)
     finally:
         for end in ends:
             os.close(end)
     return read, write
-
-
-def _describe_exit(process: int) -> tuple[str, int]:
-    """Describe how a process ended; return also the signal that ended it, or 0.
-
-    process : pidfd of the process
-
-    Raises
-    ------
-    ChildProcessError
-        If the process was reaped already, or is not a child of this process.
-
-    """
-    end = os.waitid(os.P_PIDFD, process, os.WEXITED | os.WNOWAIT)
-    assert end is not None
-    if end.si_code == os.CLD_EXITED:
-        return f"exit code {end.si_status}", 0
-    names = {s.value: s.name for s in signal.Signals}
-    return names.get(end.si_status, f"signal {end.si_status}"), end.si_status
-
-
-class _WorkerEndError(Exception):
-    """End of a worker before an expected event.
-
-    event : name of the expected event
-    verdict : verdict on the solver, if the solve had started
-    how : description of the end
-    number : signal that ended the worker, or 0
-    stage : prefix of the message
-    """
-
-    def __init__(
-        self, event: str, verdict: Verdict, how: str, number: int = 0, *, stage: str
-    ) -> None:
-        self.event = event
-        during = ("built", "solved", "timed", "measured", "done")
-        self.is_early = event not in during
-        super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
-        if self.is_early and verdict is Verdict.TIME_LIMIT:
-            # the limit `START_SECONDS` has expired, not the limit of the suite
-            verdict = Verdict.FAILED
-        self.verdict = verdict
-        self.signal = number
-        self.is_fault = False  #: True if the worker reported a fault of the harness
-        self.is_oom = False  #: True if the kernel killed the worker for lack of memory
-
-
-def _facts(reply: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields that a worker reports once, after its warm-up."""
-    cpus = reply.get("cpus", ())
-    return {"threads": reply.get("threads"), "cpu": cpus[0] if len(cpus) == 1 else None}
 
 
 def _oom_kills() -> int:

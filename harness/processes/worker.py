@@ -1,8 +1,6 @@
-"""Process that executes all measurements of one solver.
+"""Process that builds cases, measures a solver, and evaluates answers.
 
-The process follows `harness.processes.protocol`. In its warm-up, the process solves
-tiny QPs, so that imports during the first solve of a solver are not timed. The process
-answers three kinds of requests:
+The process follows `harness.processes.protocol` and answers these requests:
 
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
   the point to ``out``. Optional entries are
@@ -14,15 +12,16 @@ answers three kinds of requests:
   - ``step``: index 0, 1, … of the QP in a sequence
 
 * ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: build a case on the MPI ranks
-  (`harness.plugin.Family.on_ranks`), measure, and write the point to ``out``. If the
-  request has the entry ``first``, the ranks build the case in that entry beforehand. If
+  (`harness.plugin.Family.on_ranks`), measure, and write the point to ``out``. If
   ``source`` is "ranks", the ranks also judge the answer at the tolerance ``judged_at``.
   The event ``built`` contains the fields ``sizes``, ``qp`` and ``build_seconds`` of
   the record; the event ``measured`` is sent when the point has been written
+* ``{"build": …}`` and ``{"describe": …}``: see `harness.processes.cases`
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
-Every measurement loads the QP again, so that modifications by a solver do not affect
-later measurements.
+In its warm-up, a process with a solver solves tiny QPs, so that imports during the
+first solve are not timed. Every measurement loads the QP again, so that modifications
+by a solver do not affect later measurements.
 """
 
 from __future__ import annotations
@@ -34,7 +33,8 @@ import random
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +47,16 @@ from mortarbench.harness.files.store import write_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.case_folder import content_digest
+from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.protocol import (
-    Events,
+    Send,
     Source,
     answer_requests,
     source_of,
 )
 from mortarbench.harness.processes.ranks import Build, RanksAsOne, this_rank
 from mortarbench.harness.qp import QP, no_rows
-from mortarbench.harness.record import finite, journal_name
+from mortarbench.harness.record import journal_name
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import (
     DeclinedError,
@@ -72,47 +73,60 @@ _MAX_BALLAST = 2**18
 
 
 def serve(
-    solver: Solver,
-    request_fd: int,
-    reply_fd: int,
-    operators: Mapping[str, Maker] = NO_MAKERS,
-    build: Build | None = None,
+    worker: Worker, request_fd: int, reply_fd: int, build: Build | None = None
 ) -> None:
     """Answer requests until the pipe of requests is closed.
 
-    operators : makers of operators P by name, see `harness.operators`
     build : builds a case on all MPI ranks; None in a single process
     """
-    bench = _SolverHost(solver, operators)
     if build is None:
-        answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
+        answer_requests(worker.answer, request_fd, reply_fd)
         return
     host = this_rank(build, _limit_memory)
     if host.comm.rank:
         os.close(request_fd)
         os.close(reply_fd)
-        bench.warm_up()
+        worker.warm_up()
         serve_rank(host.comm, host)
         return
-    bench.ranks = RanksAsOne(host)
-    answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
-    bench.ranks.end()
+    worker.ranks = RanksAsOne(host)
+    answer_requests(worker.answer, request_fd, reply_fd)
+    worker.ranks.end()
 
 
-class _SolverHost:
-    """Solver with the state that persists between requests, such as a sequence."""
+@dataclass(eq=False, kw_only=True)
+class Worker:
+    """Solver and cases of a worker, with the state that persists between requests.
 
-    def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
-        self._solver = solver
-        self._operators = operators
-        self._chain: Prepare | None = None
-        self._last_step = -1  # index of the last measured step of the sequence
-        # inode, size and modification time of each verified file, by the digest of its
-        # content
-        self._verified_files: dict[str, tuple[int, ...]] = {}
-        self._ballast = np.empty(0)
-        #: the MPI ranks that solve together; None in a single process
-        self.ranks: RanksAsOne | None = None
+    operators : makers of operators P by name, see `harness.operators`
+    """
+
+    solver: Solver | None = None  #: solver to measure; None if only cases are built
+    cases: Cases | None = None  #: None if only a solver is measured
+    operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
+    #: the MPI ranks that solve together; None in a single process
+    ranks: RanksAsOne | None = None
+    _chain: Prepare | None = None  # solver of the current sequence
+    _last_step: int = -1  # index of the last measured step of the sequence
+    # digest, inode, size and modification time of each verified file
+    _verified_files: set[tuple[Any, ...]] = field(default_factory=set)
+    _ballast: Any = None  # array that shifts the addresses of other arrays
+
+    def answer(self, request: dict[str, Any], send: Send) -> Mapping[str, Any]:
+        """Answer one request; `send` sends the events before the last one."""
+        if "warm_up" in request:
+            return self.warm_up()
+        if "out" in request:
+            return self._measure(request, send)
+        send("start")
+        if "check" in request:
+            # few requests need this import
+            from mortarbench.harness.conformance.conformance import run_check
+
+            assert self.solver is not None
+            return run_check(request["check"], self.solver)._asdict()
+        assert self.cases is not None
+        return self.cases.answer(request)
 
     def warm_up(self) -> dict[str, Any]:
         """Solve a QP with bounds, and one with bounds and rows; ignore the results.
@@ -120,8 +134,13 @@ class _SolverHost:
         Code that is compiled or loaded at its first use must not be timed. The QPs
         model a chain of springs, long enough for solvers to enter most of their
         branches.
+
+        Returns
+        -------
+        the number of threads, and the CPU to which the process is bound, if unique
+
         """
-        n = 32
+        n, solver = 32, self.solver
         P = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
         pull: dict[str, Any] = dict(
             q=np.cos(np.arange(n)), lb=np.zeros(n), ub=np.full(n, np.inf)
@@ -131,46 +150,40 @@ class _SolverHost:
         one_row_each = dict(A=ones, b=np.ones(1), G=one, h=np.ones(1))
         for rows in (no_row, one_row_each):
             with suppress(DeclinedError, SolverError):
-                solve_once(self._solver, QP(P=P, **pull, **rows), 1e-6)
+                if solver is not None:
+                    solve_once(solver, QP(P=P, **pull, **rows), 1e-6)
         gc.freeze()  # exclude the loaded modules from collections during measurements
-        return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
+        cpus = sorted(os.sched_getaffinity(0))
+        return {"threads": _one_thread(), "cpu": cpus[0] if len(cpus) == 1 else None}
 
-    def answer(self, request: dict[str, Any], events: Events) -> dict[str, Any]:
-        """Answer one request: measure once, or run one check."""
-        if "check" in request:
-            from mortarbench.harness.conformance.conformance import (
-                run_check,  # few requests need it
-            )
-
-            events.start()
-            return dict(run_check(request["check"], self._solver)._asdict())
+    def _measure(self, request: dict[str, Any], send: Send) -> dict[str, Any]:
         # Place the arrays at different addresses in each measurement. Otherwise, their
         # alignment to cache lines is random but fixed for the life of the process. The
         # times of two processes of one solver may then differ by 10 % or more, however
         # often they are measured (Mytkowicz et al., ASPLOS 2009). A varying alignment
         # converts this bias into scatter, which confidence intervals include.
-        self._ballast = np.empty(0)
+        self._ballast = None
         with suppress(AttributeError):  # malloc_trim exists only in glibc
             # otherwise the allocator would reuse freed blocks at their old addresses
             ctypes.CDLL(None).malloc_trim(0)
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
-        limit, ranks, solver = request.get("memory_limit"), self.ranks, self._solver
+        assert self.solver is not None
+        ranks, solver, set_limit = self.ranks, self.solver, _limit_memory
         if ranks is not None:
-            events.reached("built", ranks.build(request["case"]))
-            qp, solver = ranks.qp, ranks.solver(solver)
+            send("built", **ranks.build(request["case"]))
+            qp, solver, set_limit = ranks.qp, ranks.solver(solver), ranks.limit
         else:
             qp = self._load(request)
-        set_limit = _limit_memory if ranks is None else ranks.limit
-        set_limit(limit)
+        set_limit(request.get("memory_limit"))
         timed = measure(
             solver,
             qp,
             request["tol"],
             prepare=self._step(request),
             once=request.get("once", False),
-            starts=events.start,
-            solved=events.solved,
-            ends=events.timed,
+            starts=partial(send, "start"),
+            solved=partial(send, "solved"),
+            ends=partial(send, "timed"),
         )
         set_limit(None)
         s, judged = timed.solution, dict[str, Any]()
@@ -178,7 +191,7 @@ class _SolverHost:
             s = replace(s, reported={**s.reported, **ranks.reported()})
         write_point(Path(request["out"]), s)
         if ranks is not None:
-            events.reached("measured", {})
+            send("measured")
             if source_of(request) is Source.RANKS:
                 fields, notes = ranks.judge(s, request["judged_at"])
                 judged = {"fields": fields, "notes": [*filter(None, notes)]}
@@ -188,7 +201,7 @@ class _SolverHost:
             "message": s.message,
             "iterations": s.iterations,
             "counts": s.counts,
-            "reported": finite(dict(s.reported)),
+            "reported": dict(s.reported),
             "worked_seconds": timed.worked_seconds,
             "solves": timed.solves,
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
@@ -199,14 +212,13 @@ class _SolverHost:
         if digest is not None:
             status = path.stat()
             # hash the file again only if inode, size or time have changed
-            version = (status.st_ino, status.st_size, status.st_mtime_ns)
-            if self._verified_files.get(digest) != version:
+            version = (digest, status.st_ino, status.st_size, status.st_mtime_ns)
+            if version not in self._verified_files:
                 if content_digest(path) != digest:
                     raise ValueError(f"{path.name} was changed on disk")
-                self._verified_files[digest] = version
+                self._verified_files.add(version)
         # A file without a digest may have any origin, so its operators are not built.
-        is_ours = digest is not None
-        return load_qp(path, operators=self._operators if is_ours else None)[0]
+        return load_qp(path, operators=None if digest is None else self.operators)[0]
 
     def _step(self, request: dict[str, Any]) -> Prepare | None:
         """Return the `prepare` function of a step; step 0 begins a new sequence.
@@ -215,7 +227,7 @@ class _SolverHost:
         treats each step as an independent QP.
         """
         step = request.get("step")
-        begin = getattr(self._solver, "chain", None)
+        begin = getattr(self.solver, "chain", None)
         if step is None or begin is None:
             return None
         if step and self._last_step != step - 1:

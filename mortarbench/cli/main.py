@@ -99,16 +99,12 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
 
 def _run(registries: Registries, argv: Sequence[str]) -> int:
     registries = installed(registries)
-    if argv[:1] in (["worker"], ["ranks"], ["generator"]):  # processes of a run
+    if argv[:1] in (["worker"], ["ranks"]):  # processes of a run
         defer_parts_of_numpy()
         from mortarbench import processes
 
-        starts = {
-            "worker": processes.worker,
-            "ranks": processes.ranks,
-            "generator": processes.case_worker,
-        }
-        return starts[argv[0]](registries, argv[1:])
+        start = processes.worker if argv[0] == "worker" else processes.ranks
+        return start(registries, argv[1:])
     for argument in takewhile(lambda text: text != "--", argv):
         if re.fullmatch(r"--[\w-]+=--", argument):  # argparse would ignore this value
             option = argument.removesuffix("=--")

@@ -21,14 +21,13 @@ from mortarbench.cli.main import main
 from mortarbench.harness import Verdict
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.names import parse
-from mortarbench.harness.processes.reaper import is_alive
 from mortarbench.harness.registry import SolverSpec, load_plugin
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.verify.verdicts import new_record
 from mortarbench.progress import display_on
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
-from tests.support.waiting import LONGEST
+from tests.support.waiting import LONGEST, is_alive
 
 SOLVERS = load_plugin(TOY_PROBLEM).solvers
 FAMILIES = load_plugin(TOY_PROBLEM).problems

@@ -22,14 +22,15 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import psutil
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from adversaries import PROBLEMS, Honest, at_the_row
 
-from mortarbench.harness.processes import case_worker as generator
-from mortarbench.harness.processes.reaper import descendants, state
-from mortarbench.harness.processes.worker import serve
+from mortarbench.harness.processes.cases import Cases
+from mortarbench.harness.processes.parent import descendants
+from mortarbench.harness.processes.worker import Worker, serve
 
 
 def processes(of_run):
@@ -44,6 +45,12 @@ def processes(of_run):
                 yield int(entry.name)
 
 
+def runs(process):
+    with suppress(psutil.Error):
+        return psutil.Process(process).status() == psutil.STATUS_RUNNING
+    return False
+
+
 class Witness(Honest):
     """Solver that fails if another process of the run uses a CPU."""
 
@@ -52,7 +59,7 @@ class Witness(Honest):
         awake = [
             process
             for process in processes(os.environ["WATCHED"])
-            if process not in mine and state(process) == "R"
+            if process not in mine and runs(process)
         ]
         if awake:
             raise RuntimeError(f"disturbed by {awake}")
@@ -341,7 +348,5 @@ SOLVERS = {
 
 if __name__ == "__main__":
     what, *pipes = sys.argv[1:]
-    if what == "generator":
-        generator.serve(generator.CaseWorker(PROBLEMS, unsolved), *map(int, pipes))
-    else:
-        serve(SOLVERS[what], *map(int, pipes))
+    cases = Cases(PROBLEMS, unsolved)
+    serve(Worker(solver=SOLVERS.get(what), cases=cases), *map(int, pipes))

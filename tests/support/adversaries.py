@@ -26,8 +26,8 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Case, Fields, InputError, Solution, Status, no_rows
 from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.plugin import About
-from mortarbench.harness.processes import case_worker as generator
-from mortarbench.harness.processes.worker import serve
+from mortarbench.harness.processes.cases import Cases
+from mortarbench.harness.processes.worker import Worker, serve
 from mortarbench.harness.verify import measure as measuring
 
 
@@ -448,7 +448,5 @@ PROBLEMS = {"tiny": Tiny(), "sized": Sized()}
 
 if __name__ == "__main__":
     what, *pipes = sys.argv[1:]
-    if what == "generator":
-        generator.serve(generator.CaseWorker(PROBLEMS, unsolved), *map(int, pipes))
-    else:
-        serve(SOLVERS[what], *map(int, pipes))
+    cases = Cases(PROBLEMS, unsolved)
+    serve(Worker(solver=SOLVERS.get(what), cases=cases), *map(int, pipes))

@@ -3,7 +3,7 @@
 A new interpreter needs half a second of CPU time for imports, more than the work of
 most tests. The server therefore forks a process instead. Like any process, the fork has
 its own memory, signals and exit code, and the requested files, environment and limits.
-Its parent is the sub-reaper of `harness.processes.reaper`, whose parent is the
+Its parent is the small parent of `harness.processes.parent`, whose parent is the
 requesting process. /proc shows the command line and environment of the fork, see
 proc(5). Only the start of an interpreter is left out; tests of this start launch
 processes in the ordinary way.
@@ -18,6 +18,7 @@ import json
 import os
 import resource
 import runpy
+import signal
 import socket
 import subprocess
 import sys
@@ -32,7 +33,7 @@ from threading import Lock
 from types import ModuleType
 
 from mortarbench.harness.limits import ONE_THREAD
-from mortarbench.harness.processes import reaper
+from mortarbench.harness.processes import parent
 
 LONGEST = 2**20  #: maximum length of a request, bytes
 LIMITS = [getattr(resource, name) for name in dir(resource) if name[:7] == "RLIMIT_"]
@@ -67,7 +68,7 @@ INSTALL = (
 class Forks:
     """Replacement of the module `subprocess` in `harness.processes.supervisor`."""
 
-    PIPE = subprocess.PIPE
+    DEVNULL = subprocess.DEVNULL
     TimeoutExpired = subprocess.TimeoutExpired
 
     def __init__(self, servers=()):
@@ -76,11 +77,11 @@ class Forks:
         self._lock = Lock()
 
     def Popen(self, args, **how):
-        """Start a worker below its sub-reaper; start other programs normally."""
-        own = [sys.executable, "-I", "-S", reaper.__file__]
-        if args[:4] != own or args[7:9] != [sys.executable, "-P"] or args[9] == "-c":
+        """Start a worker below its small parent; start other programs normally."""
+        own = [sys.executable, "-I", "-S", parent.__file__]
+        if args[:4] != own or args[8:10] != [sys.executable, "-P"] or args[10] == "-c":
             return subprocess.Popen(args, **how)
-        modules = OURS if args[9] == "-m" else PLUGINS
+        modules = OURS if args[10] == "-m" else PLUGINS
         return Forked(self._server(modules), args[4:], **how)
 
     def dask(self, arguments, env, serves):
@@ -174,27 +175,29 @@ class Program:
             time.sleep(0.001)
         return self.returncode
 
+    def send_signal(self, number):
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self):
+        self.send_signal(signal.SIGTERM)
+
     def kill(self):
-        if self.returncode is None:
-            os.kill(self.pid, 9)
+        self.send_signal(signal.SIGKILL)
 
 
 class Forked(Program):
-    """A forked worker below a sub-reaper, with the interface that supervisors use."""
+    """A forked worker below a small parent, with the interface that supervisors use."""
 
     def __init__(self, server, arguments, *, env, stdin, stdout, stderr, **how):
-        assert stdin == subprocess.PIPE
+        assert stdin == subprocess.DEVNULL
         assert how.pop("start_new_session")
         assert list(how) == ["pass_fds"]
-        assert list(map(str, how["pass_fds"])) == arguments[1:3]
-        theirs, ours = os.pipe()
-        try:
-            fds = [theirs, stdout.fileno(), stderr.fileno(), *how["pass_fds"]]
+        assert list(map(str, how["pass_fds"])) == arguments[2:4]
+        with open(os.devnull, "rb") as null:
+            fds = [null.fileno(), stdout.fileno(), stderr.fileno(), *how["pass_fds"]]
             request = {"arguments": arguments, "env": dict(env)}
             super().__init__(server.start(request, fds))
-        finally:
-            os.close(theirs)
-        self.stdin = open(ours, "wb")  # noqa: SIM115
 
 
 def adopt(orphans):
@@ -212,7 +215,7 @@ def serve(asked):
         if not message:
             return
         request = json.loads(message)
-        _, *program = request.get("program") or request["arguments"][3:]
+        _, *program = request.get("program") or request["arguments"][4:]
         if program[1] != "-m":
             # the fork reports these errors
             with suppress(OSError, SyntaxError, ValueError):
@@ -232,7 +235,7 @@ def serve(asked):
 
 
 def become(request, fds):
-    """Run the requested program, or the sub-reaper that starts this program."""
+    """Run the requested program, or the small parent that starts this program."""
     os.setsid()
     os.chdir(request["cwd"])
     os.environ.clear()
@@ -250,11 +253,14 @@ def become(request, fds):
             supervisor = sys.modules["mortarbench.harness.processes.supervisor"]
             supervisor.subprocess = Forks({PLUGINS: Server.as_fork()})
         run(None, request["program"])
-    cpu, _, _, *command = request["arguments"]
-    arguments = [cpu, *map(str, fds[3:]), *command]
-    show(ARGUMENTS, [sys.executable, "-I", "-S", reaper.__file__, *arguments])
+    run_id, cpu, _, _, *command = request["arguments"]
+    # the process of the run adopts this process
+    while os.getppid() != int(run_id) and Path(f"/proc/{run_id}").exists():
+        time.sleep(0.001)
+    arguments = [run_id, cpu, *map(str, fds[3:]), *command]
+    show(ARGUMENTS, [sys.executable, "-I", "-S", parent.__file__, *arguments])
     os.execvp = run
-    reaper.main(arguments)
+    parent.main(arguments)
 
 
 def show(field, texts):

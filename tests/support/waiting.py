@@ -1,6 +1,9 @@
 """Waiting for events in other processes, on machines of any speed."""
 
 import time
+from contextlib import suppress
+
+import psutil
 
 LONGEST = 600.0  #: maximum waiting time, s
 
@@ -11,3 +14,10 @@ def soon(condition):
     while not (holds := condition()) and time.monotonic() < deadline:
         time.sleep(0.02)
     return holds
+
+
+def is_alive(process):
+    """Return True if a process exists and is not a zombie."""
+    with suppress(psutil.NoSuchProcess):
+        return psutil.Process(process).status() != psutil.STATUS_ZOMBIE
+    return False

@@ -115,10 +115,10 @@ def test_the_worker_runs_no_function_named_by_an_untrusted_file(tmp_path):
     """A request without a digest may refer to a file of any origin."""
     hostile(tmp_path / "a.npz", "subprocess:call")
     program = (
-        "import os, sys; from mortarbench.harness.processes.worker import _SolverHost; "
+        "import os, sys; from mortarbench.harness.processes.worker import Worker; "
         "qp, out = sys.argv[1:]; "
-        "bench = _SolverHost(None, {'subprocess:call': os.abort}); "
-        "bench.answer({'qp': qp, 'out': out}, None)"
+        "worker = Worker(solver=True, operators={'subprocess:call': os.abort}); "
+        "worker.answer({'qp': qp, 'out': out}, None)"
     )
     files = [str(tmp_path / name) for name in ("a.npz", "point.npz")]
     done = subprocess.run(

@@ -24,7 +24,6 @@ from mortarbench.harness.processes.measurement import (
     scratch_folder,
 )
 from mortarbench.harness.processes.protocol import ForeignReplyError, event_of
-from mortarbench.harness.processes.reaper import is_alive, state
 from mortarbench.harness.processes.supervisor import (
     REPLACEMENT_NOTE,
     WorkerProcess,
@@ -36,7 +35,7 @@ from mortarbench.harness.running.run import run
 from mortarbench.harness.suite.suite import Suite
 from mortarbench.harness.verify.verdicts import new_record
 from tests.support import ACCIDENTS, ROOT
-from tests.support.waiting import soon
+from tests.support.waiting import is_alive, soon
 
 PLUGIN = ACCIDENTS
 START = [sys.executable, "-P", str(PLUGIN)]
@@ -94,7 +93,7 @@ def beside_a_witness(tmp_path_factory):
         bench = Bench(tmp_path_factory.mktemp("accidents"))
         assert bench("witness").verdict is Verdict.VERIFIED
         alone = processes_of(name)
-        assert len(alone) == 2  # worker, sub-reaper
+        assert len(alone) == 2  # worker and its parent
 
         def measured_beside(solver, time_limit):
             patch.setenv("WATCHED", name)
@@ -103,7 +102,7 @@ def beside_a_witness(tmp_path_factory):
                 assert len(set(processes_of(name)) - set(alone)) in (
                     0,
                     2,
-                )  # worker, sub-reaper
+                )  # worker and its parent
                 assert bench("witness").verdict is Verdict.VERIFIED
                 return record
             finally:
@@ -378,7 +377,8 @@ def test_a_full_disk_and_a_lost_file_are_faults(bench, tmp_path, write, message)
         "w.write_point = write_point\n"
         f"sys.path.insert(0, {str(PLUGIN.parent)!r})\n"
         "import accidents\n"
-        "w.serve(accidents.SOLVERS['honest'], *map(int, sys.argv[1:]))\n"
+        "worker = w.Worker(solver=accidents.SOLVERS['honest'])\n"
+        "w.serve(worker, *map(int, sys.argv[1:]))\n"
     )
 
     with pytest.raises(FaultError, match=message):
@@ -408,13 +408,8 @@ while True:
 def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, watched):
     parent = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)], cwd=ROOT)
     try:
-        # run, sub-reaper, worker, daemon
-        assert soon(lambda: len(processes_of(watched)) == 4), "\n".join(
-            f"{process} {state(process)} waits in "
-            + Path(f"/proc/{process}/wchan").read_text()
-            + f": {Path(f'/proc/{process}/cmdline').read_bytes()[-60:]!r}"
-            for process in processes_of(watched)
-        )
+        # run, parent of the worker, worker, daemon
+        assert soon(lambda: len(processes_of(watched)) == 4)
     finally:
         parent.kill()
         parent.wait()

@@ -1,22 +1,17 @@
 import json
 import os
 import signal
-import subprocess
 import sys
-import time
-from contextlib import suppress
-from itertools import count
 from pathlib import Path
 from select import select
-from types import SimpleNamespace
 
 import pytest
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.files.qpfile import save_qp
-from mortarbench.harness.processes import reaper, supervisor
-from mortarbench.harness.processes.reaper import descendants
+from mortarbench.harness.processes import supervisor
+from mortarbench.harness.processes.parent import descendants
 from mortarbench.harness.processes.supervisor import (
     LOG_BYTES,
     WorkerProcess,
@@ -24,7 +19,7 @@ from mortarbench.harness.processes.supervisor import (
 )
 from mortarbench.harness.registry import load_plugin
 from tests.support import ADVERSARIES
-from tests.support.waiting import soon
+from tests.support.waiting import is_alive, soon
 
 PLUGIN = ADVERSARIES
 
@@ -59,15 +54,6 @@ WorkerProcess(command, Path(log)).ask(request, time_limit=60, memory_limit=2000)
 
 def command(solver):
     return [sys.executable, "-P", str(PLUGIN), solver]
-
-
-def running(process):
-    """Return True if a process exists and is not a zombie."""
-    try:
-        status = Path(f"/proc/{process}/status").read_text()
-    except FileNotFoundError:
-        return False
-    return "State:\tZ" not in status
 
 
 def ignores_sigterm(process):
@@ -110,7 +96,7 @@ def test_one_process_serves_every_measurement_on_one_cpu_with_one_thread(
     assert first["pid"] == second["pid"]
     assert first["cpus"] == [fastest_first(os.sched_getaffinity(0))[0]]
     assert first["threads"] == "1"
-    assert not running(first["pid"])
+    assert not is_alive(first["pid"])
 
 
 def test_a_crashed_worker_is_replaced_and_its_last_output_is_kept(ask):
@@ -124,7 +110,7 @@ def test_a_crashed_worker_is_replaced_and_its_last_output_is_kept(ask):
 
 def test_a_crash_between_measurements_is_not_attributed_to_the_next_one(ask):
     first = ask("dieslater")
-    assert soon(lambda: not running(first.answer["counts"]["process"]))
+    assert soon(lambda: not is_alive(first.answer["counts"]["process"]))
 
     assert ask("dieslater").answer["claimed"] == "solved"
 
@@ -175,7 +161,7 @@ def test_output_of_a_solver_is_dropped_before_it_fills_the_disk(ask, tmp_path):
 def test_children_of_a_solver_end_with_its_measurement(ask):
     child = ask("forks").answer["counts"]["child"]
 
-    assert soon(lambda: not running(child))
+    assert soon(lambda: not is_alive(child))
     assert ask("forks").answer["claimed"] == "solved"
 
 
@@ -221,32 +207,15 @@ def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
         sys.executable,
         [sys.executable, "-P", "-c", ASKS, *map(json.dumps, arguments)],
     )
-    assert soon(lambda: len(descendants(parent)) == 2)  # sub-reaper and worker
+    assert soon(
+        lambda: len(descendants(parent)) == 2
+    )  # the worker's parent and the worker
     worker = descendants(parent)[1]
     assert soon(lambda: ignores_sigterm(worker))
     os.kill(parent, signal.SIGKILL)
     os.waitpid(parent, 0)
 
-    assert soon(lambda: not running(worker))
-
-
-def test_every_process_is_killed_even_if_the_machine_stalls(monkeypatch):
-    clock = count(0, 1000)
-    standing = SimpleNamespace(monotonic=lambda: next(clock), sleep=time.sleep)
-    monkeypatch.setattr(reaper, "time", standing)
-    shell = subprocess.Popen(["sh", "-c", "sleep 3600 & sleep 3600 & wait"])
-    try:
-        while len(below := descendants(shell.pid)) < 2:
-            pass
-        reaper.kill_descendants(shell.pid)
-
-        assert shell.wait(timeout=10) == 0  # the shell waits for both processes
-        assert not any(map(running, below))
-    finally:
-        for process in [shell.pid, *below]:
-            with suppress(ProcessLookupError):
-                os.kill(process, signal.SIGKILL)
-        shell.wait()
+    assert soon(lambda: not is_alive(worker))
 
 
 @pytest.mark.parametrize(

@@ -7,16 +7,14 @@ import subprocess
 import sys
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from threading import Event, Thread
 
 import pytest
 
-from mortarbench.harness.processes import reaper
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from tests.harness.processes.test_supervisor import SHOWS
-from tests.support.waiting import soon
+from tests.support.waiting import is_alive, soon
 
 LIMITS = {"time_limit": 30.0, "memory_limit": 2000.0}
 COMMAND = [sys.executable, "-c", SHOWS]
@@ -27,7 +25,7 @@ import gc, json, os, sys, tempfile
 from pathlib import Path
 from threading import Thread
 import mortarbench as mb
-from mortarbench.harness.processes.reaper import descendants
+import psutil
 
 threads, times, case, acts = *map(int, sys.argv[1:3]), sys.argv[3], sys.argv[4:]
 suite = Path(tempfile.gettempdir()) / "suite.toml"
@@ -80,7 +78,7 @@ print(json.dumps(dict(
     answers=len(answers), errors=errors,
     other=[a for a in answers if a[1] != expected[a[0]]], expected=expected,
     opened=len(open_files()) - len(before), same_stdout=sys.stdout is stdout,
-    left=descendants(os.getpid()),
+    left=[p.pid for p in psutil.Process().children()],
     scratch=[p.name for p in Path(tempfile.gettempdir()).glob("mortarbench-*")],
 )), file=sys.__stdout__)
 """
@@ -148,37 +146,6 @@ def test_closing_twice_does_not_close_another_file(worker, tmp_path):
     for file in others:
         file.write("still open")
         file.close()
-
-
-def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
-    """Test two workers from start to end; each pauses while the other works."""
-    other = WorkerProcess(COMMAND, tmp_path / "other")
-
-    def refuse(*what):
-        raise AssertionError(what)
-
-    monkeypatch.setattr(os, "kill", refuse)
-    monkeypatch.setattr(os, "killpg", refuse)
-    try:
-        for asked in (worker, other, worker):
-            assert asked.ask({}, **LIMITS).answer is not None
-        pid = other.ask({}, **LIMITS).answer["pid"]
-    finally:
-        other.close()
-    assert soon(lambda: not reaper.is_alive(pid))
-
-
-def test_a_process_that_is_not_a_descendant_is_never_signalled(monkeypatch):
-    """A list of descendants may contain an ID that another process has reused."""
-    sleep = partial(subprocess.Popen, ["sleep", "60"])
-    with sleep() as root, sleep() as stranger:
-        found = [[stranger.pid], [stranger.pid], []]
-        monkeypatch.setattr(reaper, "descendants", lambda *_: found.pop(0))
-        reaper.kill_descendants(root.pid)
-        assert found == []
-        assert reaper.state(stranger.pid) in "SR"
-        for process in (root, stranger):
-            process.kill()
 
 
 def test_a_worker_reaped_by_other_code_is_replaced(worker):
@@ -281,7 +248,7 @@ def test_a_terminated_solve_cleans_up_and_prints_one_line(tmp_path, number, code
     assert solve.returncode == code
     assert len(said.splitlines()) == 1, said
     assert not list(tmp_path.glob("mortarbench-*"))
-    assert soon(lambda: not reaper.is_alive(process))
+    assert soon(lambda: not is_alive(process))
 
 
 HANGS = """
@@ -357,55 +324,3 @@ class Slow(Family):
 
 PROBLEMS = {"slow": Slow()}
 """
-
-
-#: worker that creates and fills a System V segment of 64 MiB, and writes the number of
-#: the segment, since other programs may create segments at the same time
-SEGMENT = SHOWS.replace(
-    '    reply(event="start")\n',
-    '    reply(event="start")\n'
-    "    import ctypes\n"
-    "    libc = ctypes.CDLL(None)\n"
-    "    libc.shmat.restype = ctypes.c_void_p\n"
-    "    segment = libc.shmget(0, 2**26, 0o1600)\n"
-    "    open(FILE, 'w').write(str(segment))\n"
-    "    at = libc.shmat(segment, None, 0)\n"
-    "    ctypes.memset(at, 1, 2**26)\n"
-    "    import time; time.sleep(0.5)\n",
-)
-
-
-@pytest.mark.skipif(not Path(reaper.SEGMENTS).exists(), reason="no System V segments")
-@pytest.mark.parametrize("memory_limit", [2000.0, 60.0])
-def test_segments_of_a_worker_count_for_its_limit_and_are_removed_with_it(
-    tmp_path, memory_limit
-):
-    file = tmp_path / "segment"
-    script = SEGMENT.replace("FILE", repr(str(file)))
-    worker = WorkerProcess([sys.executable, "-c", script], tmp_path / "log")
-    try:
-        reply = worker.ask({}, time_limit=30.0, memory_limit=memory_limit)
-        if memory_limit == 60.0:
-            assert reply.verdict == "memory_limit"
-        else:
-            assert reply.peak_mib > 64
-            assert int(file.read_text()) in reaper.shared_segments()
-    finally:
-        worker.close()
-    assert int(file.read_text()) not in reaper.shared_segments()
-
-
-@pytest.mark.skipif(not Path(reaper.SEGMENTS).exists(), reason="no System V segments")
-def test_segments_of_a_worker_go_when_its_parent_is_killed(tmp_path):
-    file = tmp_path / "segment"
-    script = SEGMENT.replace("FILE", repr(str(file)))
-    asks = (
-        "import sys; from pathlib import Path\n"
-        "from mortarbench.harness.processes.supervisor import WorkerProcess\n"
-        f"worker = WorkerProcess([sys.executable, '-c', {script!r}],"
-        " Path(sys.argv[1]))\n"
-        "worker.ask({}, time_limit=60, memory_limit=2000)\n"
-        "import os; os.kill(os.getpid(), 9)\n"
-    )
-    subprocess.run([sys.executable, "-c", asks, str(tmp_path / "log")])
-    assert soon(lambda: int(file.read_text()) not in reaper.shared_segments())

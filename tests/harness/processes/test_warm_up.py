@@ -10,8 +10,8 @@ import pytest
 from scipy.sparse import csc_array
 
 from mortarbench.harness import QP, Case, Family, no_rows
-from mortarbench.harness.processes import case_worker
-from mortarbench.harness.processes.case_worker import CaseWorker
+from mortarbench.harness.processes import cases
+from mortarbench.harness.processes.cases import Cases
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Slow(Family):
 @pytest.fixture
 def build(tmp_path):
     family = Slow()
-    worker = CaseWorker({"slow": family}, lambda _: None)
+    worker = Cases({"slow": family}, lambda _: None)
 
     def ask(form, n=1):
         request = {
@@ -64,6 +64,6 @@ def test_the_first_dual_case_of_a_process_is_built_twice_and_the_second_counts(b
 
 
 def test_a_case_that_takes_long_is_not_built_twice(build, monkeypatch):
-    monkeypatch.setattr(case_worker, "MAX_WARM_UP_SECONDS", 0.02)
+    monkeypatch.setattr(cases, "MAX_WARM_UP_SECONDS", 0.02)
     assert build("dual", n=2) == 0.01
     assert build.family.built == ["dual"]

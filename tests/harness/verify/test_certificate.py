@@ -23,7 +23,8 @@ from mortarbench.harness.crossval.references import ReferencePoint, reference_po
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.names import parse
-from mortarbench.harness.processes import case_worker as generator
+from mortarbench.harness.processes import cases
+from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.verdicts import certified, has_point
 from mortarbench.problems import PROBLEMS
@@ -296,7 +297,7 @@ def test_equal_points_are_certified_once_and_others_again(tmp_path, monkeypatch)
         calls.append(s)
         return certified(case, s)
 
-    monkeypatch.setattr(generator, "certified", counted)
+    monkeypatch.setattr(cases, "certified", counted)
     name = parse("beam-ring/Nr=4/Nh=3/step=1/dual", PROBLEMS)
     of = {"family": "beam-ring", "params": dict(name.params), "form": name.form}
     at = {
@@ -305,7 +306,7 @@ def test_equal_points_are_certified_once_and_others_again(tmp_path, monkeypatch)
         "fields": None,
         "keep": 1,
     }
-    made = generator.CaseWorker(PROBLEMS, reference_solution)
+    made = Cases(PROBLEMS, reference_solution)
     qp = name.build(reference_solution).qp
     s = SOLVERS["clarabel"].prepare(qp, 1e-8)()
 

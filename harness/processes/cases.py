@@ -1,28 +1,21 @@
-"""Process that builds cases; the code of families runs here, not in the parent.
+"""Cases that a worker builds and evaluates; the code of families runs here.
 
-The process follows `harness.processes.protocol` and answers four kinds of requests:
+The requests and their answers are:
 
 * ``{"build": NAME, "qp": PATH, "keep": N}`` builds the case and writes its QP to PATH.
-  Reply: ``{"event": "done", "meta": {…}}``, where ``meta`` includes a digest of the
-  coefficients of the QP. If the request has the entry ``"first": NAME``, that case is
-  built and discarded beforehand
+  Answer: ``{"meta": {…}}``, which includes a digest of the coefficients of the QP
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates the
-  point in the file ``point``. Reply: ``{"event": "done", "quantities": {…}, "bounds":
-  {…}, "notes": […], "seconds": …}``, with the physical quantities of the point, the
-  bounds on its error, and the time in which the quantities were computed. If ``fields``
-  is a path and the case defines a deformed state, this state is written to ``fields``
-* ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
-  solver and writes the solution to the second file. This request is sent if the
-  residuals do not decide a verdict. Reply: ``{"event": "done", "found": …}``, false if
-  the reference solver fails
+  point in the file ``point``. Answer: ``{"quantities": {…}, "bounds": {…}, "notes":
+  […], "seconds": …}``, with the physical quantities of the point, the bounds on its
+  error, and the time in which the quantities were computed. If ``fields`` is a path and
+  the case defines a deformed state, this state is written to ``fields``
 
-If a case cannot be built, the reply to the first two requests is ``{"event": "done",
-"unbuilt": REASON, "trace": TEXT, "past_end": …}``; ``past_end`` is true if the case
-lies beyond the last problem of a sequence (`PastEndError`). NAME is ``{"family": …,
-"params": {…}, "form": …, "name": …}``; N is the number of cases to keep in memory. The
-map from a point to physical quantities is code and cannot be stored in a file. A case
-whose QP is in the cache, but which is not in memory, is therefore built again before a
-point is evaluated.
+If a case cannot be built, the answer is ``{"unbuilt": REASON, "trace": TEXT,
+"past_end": …}``; ``past_end`` is true if the case lies beyond the last problem of a
+sequence (`PastEndError`). NAME is ``{"family": …, "params": {…}, "form": …, "name":
+…}``; N is the number of cases to keep in memory. The map from a point to physical
+quantities is code and cannot be stored in a file. A case whose QP is in the cache, but
+which is not in memory, is therefore built again before a point is evaluated.
 """
 
 from __future__ import annotations
@@ -34,22 +27,17 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-
 from mortarbench.harness.errors import PastEndError
-from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.files.store import (
     digest_of,
     field_arrays,
     point_arrays,
     read_point,
     write_arrays,
-    write_point,
 )
 from mortarbench.harness.names import CaseId, unbuilt
-from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Case, Family, Reference
-from mortarbench.harness.processes.protocol import Events, answer_requests
 from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
@@ -65,15 +53,11 @@ MAX_WARM_UP_SECONDS = 10.0
 
 
 @dataclass(eq=False)
-class CaseWorker:
-    """Builder of the cases of `families`, with the injected `reference` solver.
-
-    operators : makers of operators P by name, see `harness.operators`
-    """
+class Cases:
+    """Cases of `families`, built with the injected `reference` solver."""
 
     families: Mapping[str, Family]
     reference: Reference
-    operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     #: cases in memory by canonical name, least recently used first
     _cases: dict[str, Case] = field(default_factory=dict)
     _build_seconds: float = 0.0  # duration of the last build, s
@@ -85,8 +69,6 @@ class CaseWorker:
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request; the reply reports failures of the family's code."""
-        if "solve" in request:
-            return self._solve(Path(request["solve"]), Path(request["point"]))
         fields = request.get("build") or request["describe"]
         name = CaseId(**{**fields, "family": self.families[fields["family"]]})
         try:
@@ -136,20 +118,12 @@ class CaseWorker:
         key = name.name, digest_of(point_arrays(s))
         if key in self._bounds:
             bounds, objection = self._bounds[key]
-            return {
-                k: v for k, v in bounds.items() if k != "certify_seconds"
-            }, objection
+            known = {k: v for k, v in bounds.items() if k != "certify_seconds"}
+            return known, objection
         while len(self._bounds) >= MAX_STORED_BOUNDS:
             del self._bounds[next(iter(self._bounds))]
         self._bounds[key] = certified(case, s)
         return self._bounds[key]
-
-    def _solve(self, qp: Path, point: Path) -> dict[str, Any]:
-        try:
-            write_point(point, self.reference(load_qp(qp, operators=self.operators)[0]))
-        except (ArithmeticError, ValueError, np.linalg.LinAlgError):
-            return {"found": False}
-        return {"found": True}
 
     def _case(self, name: CaseId, keep: int) -> Case:
         case = self._cases.pop(name.name, None)
@@ -184,13 +158,3 @@ class CaseWorker:
             "dualise_seconds": case.dualise_seconds,
         }
         return {"meta": {**meta, **seconds, "qp": digest}}
-
-
-def serve(worker: CaseWorker, request_fd: int, reply_fd: int) -> None:
-    """Answer requests until the pipe of requests is closed."""
-
-    def handle(request: dict[str, Any], events: Events) -> dict[str, Any]:
-        events.start()
-        return worker.answer(request)
-
-    answer_requests(handle, lambda: None, request_fd, reply_fd)
