@@ -58,9 +58,7 @@ class Watch:
 
     def advance(self, record):
         self.records.append((record.solver, record.repeat, record.total_seconds))
-        self.solving.append(
-            record.total_seconds * (record.inner_loops + record.untimed_loops)
-        )
+        self.solving.append(record.total_seconds * (record.inner + record.untimed))
         self.at.append(perf_counter())
         self.synced.append(self._fsync_seconds)
         self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))

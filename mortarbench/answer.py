@@ -96,7 +96,7 @@ class Answer:
     @property
     def verdict(self) -> Verdict:
         """Verdict of the harness; an answer is verified regardless of the claim."""
-        return self.record.verdict
+        return self.record.status
 
     @property
     def residuals(self) -> Residuals | None:
@@ -297,7 +297,7 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
     model may be inadequate: no node or only one node is in contact, or displacements
     are too large for linear kinematics.
     """
-    if record.verdict is not Verdict.VERIFIED or solution is None:
+    if record.status is not Verdict.VERIFIED or solution is None:
         return ()
     reasons = []
     bound = record.energy_bound
@@ -509,7 +509,7 @@ def solver_session(
             parts = case.id.family.subdomains(case.id.form, case.id.params)
             if parts < ranks:
                 record = record.replace(
-                    verdict=Verdict.DECLINED, message=too_few_parts(parts, ranks)
+                    status=Verdict.DECLINED, message=too_few_parts(parts, ranks)
                 )
                 return Answer(
                     case=case,

@@ -138,14 +138,14 @@ def measurement_line(record: Record) -> str:
     """Return the result of a measurement in one line."""
     seconds = record.total_seconds
     detail = "" if seconds is None else f" in {seconds:.3g} s"
-    if record.verdict is Verdict.DECLINED and record.message:
+    if record.status is Verdict.DECLINED and record.message:
         detail = f": {record.message[:_REASON_LENGTH]}"
-    return f"{record.solver} on {record.case}: {record.verdict.words}{detail}"
+    return f"{record.solver} on {record.case}: {record.status.words}{detail}"
 
 
 def is_notable(record: Record) -> bool:
     """Return True if a measurement is neither verified nor declined."""
-    return not record.verdict.is_verified and record.verdict is not Verdict.DECLINED
+    return not record.status.is_verified and record.status is not Verdict.DECLINED
 
 
 class _Bar(_Display):

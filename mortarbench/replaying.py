@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from mortarbench.harness import checked
 from mortarbench.harness.checked import text
@@ -65,7 +66,7 @@ class Replay:
     @property
     def reproduced(self) -> bool:
         """True if the verdicts are equal and the QPs are not known to differ."""
-        return self.same_qp is not False and self.then.verdict is self.now.verdict
+        return self.same_qp is not False and self.then.status is self.now.status
 
     def __repr__(self) -> str:
         return render(self)
@@ -75,7 +76,7 @@ class Replay:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as plain data for JSON."""
-        lines = {"then": self.then.to_dict(), "now": self.now.to_dict()}
+        lines = {"then": structs.asdict(self.then), "now": structs.asdict(self.now)}
         data: dict[str, Any] = finite(
             {**asdict(self), **lines, "reproduced": self.reproduced}
         )
@@ -198,13 +199,13 @@ def render(c: Replay) -> str:
     elif c.same_qp is False:
         lines.append("Not reproduced: the case now has a different QP.")
     else:
-        lines.append(f"Not reproduced: {c.then.verdict} then, {c.now.verdict} now.")
+        lines.append(f"Not reproduced: {c.then.status} then, {c.now.status} now.")
     return "\n".join(lines)
 
 
 def _verdicts(c: Replay) -> Iterable[list[str]]:
     then, now = c.then, c.now
-    yield ["status", then.verdict, now.verdict, _same(then.verdict is now.verdict)]
+    yield ["status", then.status, now.status, _same(then.status is now.status)]
     yield [
         "claimed",
         _text(then.claimed),

@@ -65,21 +65,15 @@ class Results:
 
     @cached_property
     def df(self) -> DataFrame:
-        """Table with one row per measurement and one column per field of the journal.
+        """Table with a row per measurement and a column per field of the journal."""
+        from mortarbench.harness.results.frame import frame_of
 
-        Empty mappings are replaced by None, because Parquet cannot store them.
-        """
-        from pandas import DataFrame
-
-        rows = [record.to_dict() for record in self.records]
-        return DataFrame(
-            [{k: None if v == {} else v for k, v in r.items()} for r in rows]
-        )
+        return frame_of(self.records)
 
     @property
     def refuted(self) -> tuple[Record, ...]:
         """Requested measurements in which the solver's claim is refuted."""
-        return tuple(r for r in self._requested if r.verdict in REFUTED)
+        return tuple(r for r in self._requested if r.status in REFUTED)
 
     @property
     def failed(self) -> tuple[Record, ...]:
@@ -91,7 +85,7 @@ class Results:
         return tuple(
             r
             for r in self._requested
-            if r.verdict not in excluded and not r.verdict.is_verified
+            if r.status not in excluded and not r.status.is_verified
         )
 
     @property
@@ -107,7 +101,7 @@ class Results:
         """Return counts and failures as plain data, the output of ``run --json``."""
         counts: dict[str, Counter[str]] = {}
         for r in self._requested:
-            counts.setdefault(r.solver, Counter())[r.verdict.value] += 1
+            counts.setdefault(r.solver, Counter())[r.status.value] += 1
         return {
             "folder": str(self.folder),
             "measurements": len(self.records),
@@ -193,7 +187,7 @@ def _named(r: Record) -> dict[str, Any]:
         "solver": r.solver,
         "tol": r.tol,
         "repeat": r.repeat,
-        "status": r.verdict.value,
+        "status": r.status.value,
         "claimed": r.claimed,
         "message": r.message,
     }

@@ -145,11 +145,11 @@ def summary_rows(records: Sequence[Record], solvers: Sequence[str]) -> list[list
     present = {r.solver for r in records}
     for solver in dict.fromkeys([*solvers, *sorted(present)]):
         every = [r for r in records if r.solver == solver]
-        declined = [r for r in every if r.verdict is Verdict.DECLINED]
-        measured = [r for r in every if r.verdict is not Verdict.DECLINED]
+        declined = [r for r in every if r.status is Verdict.DECLINED]
+        measured = [r for r in every if r.status is not Verdict.DECLINED]
         claimed = [r for r in measured if r.claimed == CLAIMED_SOLVED]
-        verified = [r for r in measured if r.verdict.is_verified]
-        refuted = [r for r in claimed if not r.verdict.is_verified]
+        verified = [r for r in measured if r.status.is_verified]
+        refuted = [r for r in claimed if not r.status.is_verified]
         other = len(measured) - len(verified) - len(refuted)
         counts = map(len, (measured, claimed, verified, refuted, declined))
         rows.append([solver, *map(str, counts), str(other)])
@@ -173,14 +173,14 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
     )
     per = "" if in_space(r.quantities) else "/m"
     units = _units(per) if "dofs" in r.quantities else {}
-    several = r.inner_loops > 1
-    timed = f"s (mean of {r.inner_loops} runs)" if several else "s (one run)"
+    several = r.inner > 1
+    timed = f"s (mean of {r.inner} runs)" if several else "s (one run)"
     rows = [
         ("case", r.case),
         ("size", ", ".join(f"{count} {what}" for what, count in r.sizes.items())),
         ("solver", f"{r.solver} ({options})" if options else r.solver),
         ("tolerance", f"{r.tol:g}"),
-        ("status", f"{r.verdict.words} (claimed {r.claimed})"),
+        ("status", f"{r.status.words} (claimed {r.claimed})"),
         ("message", r.message),
         ("iterations", _text(r.iterations)),
         ("counts", _text(r.counts)),

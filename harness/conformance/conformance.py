@@ -311,7 +311,7 @@ def _remembers_no_answer(solver: Solver) -> None:
     if timed.solution.status is Status.DECLINED:
         raise DeclinedError(timed.solution.message)
     _judge(qp, timed.solution, VERIFIED_FACTOR * 1e-6)
-    if timed.cost.remembered:
+    if timed.cost.get("remembered"):
         raise ContractError(
             "solves of a QP are much faster than solves of a slightly different one, "
             "or have the same answer; expected no results of earlier solves"

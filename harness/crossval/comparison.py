@@ -238,7 +238,7 @@ def _judged(g: StoredAnswer, unassessed: str = "", **errors: float | None) -> An
     elif unassessed:
         outcome, reasons = Outcome.NOT_VALIDATED, [unassessed]
     # the certificate of the run is of another point if there is a remark
-    elif now is r.verdict and not g.remark and (broken := _contradiction(answer, r)):
+    elif now is r.status and not g.remark and (broken := _contradiction(answer, r)):
         outcome, reasons = Outcome.CONTRADICTED, [broken]
     else:
         outcome = Outcome.AGREES

@@ -85,7 +85,7 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
     """Group records by physical case, sorted by name; omit declined QPs."""
     groups: dict[str, list[Record]] = {}
     for r in sorted(records, key=lambda r: (r.case, -r.tol, r.solver, r.repeat)):
-        if r.verdict is not Verdict.DECLINED:
+        if r.status is not Verdict.DECLINED:
             groups.setdefault(r.case.removesuffix(f"/{r.form}"), []).append(r)
     return groups
 
@@ -106,7 +106,7 @@ def _group(
         if r.identity in lost:
             continue
         if not r.vectors or not (
-            r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
+            r.claimed == Status.SOLVED or r.status is Verdict.VERIFIED
         ):
             pointless.append(r)
             continue
@@ -160,7 +160,7 @@ def _without_point(r: Record, cases: Mapping[str, Case], solved: float) -> Answe
     if _is_proven(r):
         text = "the certificate could not be computed again"
         return answer_of(r, Outcome.NOT_VALIDATED, text)
-    text = ": ".join(filter(None, (r.verdict.words, r.message)))
+    text = ": ".join(filter(None, (r.status.words, r.message)))
     return answer_of(r, Outcome.UNANSWERED, text)
 
 
@@ -214,7 +214,7 @@ def _stored_answer(path: Path, r: Record, case: Case) -> StoredAnswer:
 
 def _is_proven(r: Record) -> bool:
     """Return True if the run proved the claim that the QP has no solution."""
-    return r.verdict.is_verified and r.verdict is not Verdict.VERIFIED
+    return r.status.is_verified and r.status is not Verdict.VERIFIED
 
 
 def _apart(r: Record) -> Record:

@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from math import inf, isinf
@@ -23,13 +23,7 @@ from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.protocol import Source, source_of
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
-from mortarbench.harness.record import (
-    MEASURED,
-    Measurement,
-    Record,
-    Verdict,
-    journal_name,
-)
+from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import REMEMBERED_SPEEDUP
 from mortarbench.harness.verify.verdicts import (
@@ -111,7 +105,7 @@ def measure_and_judge(
         elif reply.built is not None:
             record = record.replace(**reply.built)
         if reply.answer is None:
-            return JudgedMeasurement(record.replace(verdict=reply.verdict), None)
+            return JudgedMeasurement(record.replace(status=reply.verdict), None)
         solution = replace(
             read_point(out, Status(reply.answer["claimed"])),
             iterations=reply.answer["iterations"],
@@ -131,7 +125,7 @@ def measure_and_judge(
     by_ranks = source_of(request) is Source.RANKS
     if by_ranks:
         fields = dict(reply.answer["fields"])
-        fields["verdict"] = Verdict(fields["verdict"])
+        fields["status"] = Verdict(fields["status"])
         record = claimed(record, solution).replace(**fields)
         notes += reply.answer["notes"]
     else:
@@ -144,14 +138,12 @@ def _with_cost(reply: Reply, record: Record) -> tuple[Record, *tuple[str, ...]]:
     """Add the cost of a measurement to its record; return the record with any notes."""
     assert reply.answer is not None
     cost, *notes = _plausible_cost(reply)
-    notes += [REMEMBERED_NOTE] * bool(cost.remembered)
-    if (
-        record.ranks > 1
+    notes += [REMEMBERED_NOTE] * bool(cost.get("remembered"))
+    if record.ranks > 1:
         # rank 0 measures only its own memory, the parent measures the memory of all
         # ranks
-    ):
-        cost = replace(cost, peak_mib=reply.peak_mib)
-    return record.replace(**asdict(cost)), *notes
+        cost["peak_mib"] = reply.peak_mib
+    return record.replace(**cost), *notes
 
 
 def case_request(record: Record) -> dict[str, Any]:
@@ -160,19 +152,17 @@ def case_request(record: Record) -> dict[str, Any]:
     return {"case": case}
 
 
-def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
+def _plausible_cost(reply: Reply) -> tuple[dict[str, Any], *tuple[str, ...]]:
     """Return the worker's times, or the parent's time and a note if they are longer."""
     answer, elapsed = reply.answer, reply.elapsed_seconds
     assert answer is not None
-    cost = Measurement(**{name: answer[journal_name(name)] for name in MEASURED})
+    cost = dict(answer["cost"])
     worked = answer["worked_seconds"]
-    if elapsed is None or cost.total_seconds is None or 0 <= worked <= elapsed:
+    if elapsed is None or "total_seconds" not in cost or 0 <= worked <= elapsed:
         return (cost,)
     mean = elapsed / answer["solves"]
-    corrected = replace(
-        cost, prepare_seconds=None, solve_seconds=None, total_seconds=mean
-    )
-    return corrected, (
+    cost |= {"prepare_seconds": None, "solve_seconds": None, "total_seconds": mean}
+    return cost, (
         f"the worker reported {worked:.3g} s of work, but was done after {elapsed:.3g} "
         "s by the parent's clock; the parent's time is recorded"
     )
@@ -183,15 +173,15 @@ def _check_memory(limit: float, record: Record) -> Record:
 
     limit : memory limit, in MiB
     """
-    if record.verdict is Verdict.DECLINED:
+    if record.status is Verdict.DECLINED:
         return record
     peak = record.peak_mib
     if peak is not None and peak > limit:
         message = f"reached {peak:.0f} MiB, above the limit of {limit:g} MiB"
-        return noted(record.replace(verdict=Verdict.MEMORY_LIMIT), message)
-    succeeded = record.verdict.is_verified or record.verdict is Verdict.INACCURATE
+        return noted(record.replace(status=Verdict.MEMORY_LIMIT), message)
+    succeeded = record.status.is_verified or record.status is Verdict.INACCURATE
     if not succeeded and out_of_memory(record.message, peak, limit):
-        return record.replace(verdict=Verdict.MEMORY_LIMIT)
+        return record.replace(status=Verdict.MEMORY_LIMIT)
     return record
 
 
@@ -258,7 +248,7 @@ def measure_once(
             record, solution, needs_evaluation = once()
         except FaultError:
             record, solution, needs_evaluation = once()
-    declined = record.verdict is Verdict.DECLINED
+    declined = record.status is Verdict.DECLINED
     if solution is None or declined or not needs_evaluation:
         return record, solution
     if not record.quantities:

@@ -284,7 +284,7 @@ class RanksAsOne:
         case = self.host.case
         # after a failure of ranks, products would fail again
         if case is None or (s.status is Status.FAILED and not has_point(s)):
-            return {"verdict": Verdict(s.status)}, []
+            return {"status": Verdict(s.status)}, []
         # factors that code of a solver may have reached are not used
         self._lead("served.forget")
         return evaluated(case, s, tol)

@@ -33,7 +33,7 @@ import random
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,6 @@ from mortarbench.harness.processes.protocol import (
 )
 from mortarbench.harness.processes.ranks import Build, RanksAsOne, this_rank
 from mortarbench.harness.qp import QP, no_rows
-from mortarbench.harness.record import journal_name
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import (
     DeclinedError,
@@ -204,7 +203,7 @@ class Worker:
             "reported": dict(s.reported),
             "worked_seconds": timed.worked_seconds,
             "solves": timed.solves,
-            **{journal_name(k): v for k, v in asdict(timed.cost).items()},
+            "cost": timed.cost,
         }
 
     def _load(self, request: dict[str, Any]) -> QP:

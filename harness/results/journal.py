@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from json import JSONDecodeError
 from pathlib import Path
 from typing import Any, Self
 
@@ -140,10 +139,8 @@ def _records(path: Path) -> Iterator[tuple[int, Record]]:
     for number, line in enumerate(read_lines(path, "a journal"), 1):
         try:
             yield number, Record.from_json(line, shared)
-        except (JSONDecodeError, UnicodeDecodeError):
-            raise InputError(
-                f"{path}, line {number}: damaged; expected a JSON object, as written "
-                "by a run; restore the file, or delete the line and run again"
-            ) from None
         except ValueError as e:
-            raise InputError(f"{path}, line {number}: {e}") from None
+            raise InputError(
+                f"{path}, line {number}: {e}, as written by a run; restore the file, "
+                "or delete the line and run again"
+            ) from None

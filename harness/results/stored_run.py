@@ -145,7 +145,7 @@ def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:
             break
     else:
         spec = SolverSpec(name=name, label=name)
-    return replace(spec, label=record.solver, role=record.role, ranks=record.ranks)
+    return replace(spec, label=record.solver, role=record.arm, ranks=record.ranks)
 
 
 def _with_options(

@@ -146,14 +146,14 @@ class Executor:
                 time_limit=block.time_limit,
                 memory_limit=block.memory_limit,
             )
-            if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
+            if record.status in (Verdict.CRASHED, Verdict.FAILED):
                 refuse_full_disk(self.scratch, "")  # a full disk may be the cause
             is_pointless = solution is None or not has_point(solution)
             if solution is None or is_pointless or needs_evaluation:
                 yield self._describe(block, record, solution)
             else:
                 yield Result(record=record, point=point_arrays(solution))
-            stopped = is_pointless and record.verdict is not Verdict.DECLINED
+            stopped = is_pointless and record.status is not Verdict.DECLINED
             # a failed step loses the solver's data for later steps
             if block.is_sequence and stopped:
                 yield from _unreached_steps(available[step + 1 :], record)
@@ -162,7 +162,7 @@ class Executor:
             self._worker(turn[0].solver).close()  # ranks remain between steps only
         for record in turn[len(available) :]:
             declined = record.replace(
-                verdict=Verdict.DECLINED, message=self._end_reason
+                status=Verdict.DECLINED, message=self._end_reason
             )
             yield Result(record=declined)
 
@@ -218,7 +218,7 @@ class Executor:
         """Add physical quantities and error bounds, computed by the case worker."""
         if solution is None or not has_point(solution):
             return Result(record=record)
-        first = record.verdict is Verdict.VERIFIED and record.repeat == 0
+        first = record.status is Verdict.VERIFIED and record.repeat == 0
         fields = self.scratch / "fields.npz"
         fields.unlink(missing_ok=True)
         request = {
@@ -327,7 +327,7 @@ def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
     """
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"
-        yield Result(record=record.replace(verdict=end.verdict, message=reason))
+        yield Result(record=record.replace(status=end.status, message=reason))
 
 
 class _BuildError(Exception):

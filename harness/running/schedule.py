@@ -64,9 +64,9 @@ class Schedule:
         self._next = max(self._next, record.block + 1)
         if "variables" in record.sizes:
             self._variables[record.case] = record.sizes["variables"]
-        if record.verdict is Verdict.DECLINED:
+        if record.status is Verdict.DECLINED:
             self._declined.add((record.solver, _cell(record)))
-        if record.verdict in LIMITS and record.mode == "cold":
+        if record.status in LIMITS and record.mode == "cold":
             for line in self.suite.lines:
                 if record.case not in line[1:]:
                     continue

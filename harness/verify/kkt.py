@@ -417,12 +417,12 @@ def rejudged(record: Record, factor: float) -> Verdict:
     on this factor.
     """
     if record.claimed is None:
-        return record.verdict
+        return record.status
     stored = (getattr(record, name) for name in Residuals._fields)
     residuals = Residuals(*(np.inf if r is None else r for r in stored))
     claimed, tol = Status(record.claimed), record.judged_at
-    if verdict(claimed, residuals, tol) is not record.verdict:
-        return record.verdict
+    if verdict(claimed, residuals, tol) is not record.status:
+        return record.status
     return verdict(claimed, residuals, tol, factor)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
@@ -25,7 +25,6 @@ from mortarbench.harness.limits import too_large
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.plugin import About, Solver
 from mortarbench.harness.qp import NEEDS_MATRICES, QP, Vector
-from mortarbench.harness.record import Measurement
 from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
@@ -61,7 +60,7 @@ class Timed(NamedTuple):
     """A solution, and the cost of computing it."""
 
     solution: Solution  #: solution, whose vectors are float arrays of the right shapes
-    cost: Measurement  #: times and memory
+    cost: Mapping[str, Any]  #: times and memory, as fields of a record
     worked_seconds: float = 0.0  #: total time of all solves, also of untimed ones, s
     solves: int = 0  #: number of all solves
 
@@ -94,7 +93,7 @@ def measure(
     first solve takes more than `MAX_UNTIMED_SECONDS`, it is the only solve, and it is
     timed.
 
-    The solver reuses answers (`Measurement.remembered`) if it returns the same point
+    The solver reuses answers (`Record.remembered`) if it returns the same point
     for both QPs, or if each of `MIN_PERTURBED_SOLVES` solves of perturbed QPs takes
     more than `REMEMBERED_SPEEDUP` times the median of the timed solves.
 
@@ -129,21 +128,21 @@ def measure(
         except (DeclinedError, SolverError) as e:
             declined = isinstance(e, DeclinedError)
             status = Status.DECLINED if declined else Status.FAILED
-            return Timed(Solution.without_point(qp, status, str(e)), Measurement())
+            return Timed(Solution.without_point(qp, status, str(e)), {})
         finally:
             ends()
     means = [sum(phase) / len(repeats) for phase in zip(*repeats, strict=True)]
-    cost = Measurement(
-        prepare_seconds=means[0],
-        solve_seconds=means[1],
-        total_seconds=sum(means),
-        peak_mib=max((p for p in peaks if p is not None), default=None),
-        prepare_peak_mib=peaks[0],
-        solve_peak_mib=peaks[1],
-        inner_loops=len(repeats),
-        untimed_loops=untimed,
-        remembered=remembered,
-    )
+    cost = {
+        "prepare_seconds": means[0],
+        "solve_seconds": means[1],
+        "total_seconds": sum(means),
+        "peak_mib": max((p for p in peaks if p is not None), default=None),
+        "prepare_peak_mib": peaks[0],
+        "solve_peak_mib": peaks[1],
+        "inner": len(repeats),
+        "untimed": untimed,
+        "remembered": remembered,
+    }
     return Timed(_checked(answer, qp), cost, run.worked_seconds, run.solves)
 
 

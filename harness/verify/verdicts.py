@@ -77,11 +77,11 @@ def new_record(
         tol=tol,
         repeat=repeat,
         block=block,
-        verdict=Verdict.FAILED,
+        status=Verdict.FAILED,
         environment=environment,
         mode=mode,
         accuracy=accuracy,
-        role=spec.role,
+        arm=spec.role,
         ranks=spec.ranks,
         started=datetime.now(UTC).isoformat(timespec="milliseconds"),
         session=session,
@@ -112,7 +112,7 @@ def judgement(qp: QP, s: Solution, tol: float) -> tuple[dict[str, Any], str]:
     The second result is a note on the reason if the answer is not verified, else "".
     """
     if s.status is Status.DECLINED:
-        return {"verdict": Verdict.DECLINED}, ""
+        return {"status": Verdict.DECLINED}, ""
     with np.errstate(all="ignore"):  # a point may contain NaN, inf, or 1e300
         residuals, objective = kkt_residuals(qp, s), qp.objective(s.x)
     outcome, note = verdict(s.status, residuals, tol), ""
@@ -122,7 +122,7 @@ def judgement(qp: QP, s: Solution, tol: float) -> tuple[dict[str, Any], str]:
     elif s.status is Status.SOLVED and not outcome.is_verified:
         note = diagnosis(qp, s, tol)
     return {
-        "verdict": outcome,
+        "status": outcome,
         "objective": objective,
         "approximate_scale": scaling_of(qp).is_approximate,
         **residuals._asdict(),

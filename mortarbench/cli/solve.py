@@ -88,7 +88,7 @@ def _print(answer: Answer, options: Namespace) -> None:
     record = answer.record
     if options.json:
         print(json.dumps(answer.to_dict(), allow_nan=False))
-    elif record.verdict is not Verdict.DECLINED:
+    elif record.status is not Verdict.DECLINED:
         print(answer)
         from mortarbench.text import convergence, legend
 
@@ -96,7 +96,7 @@ def _print(answer: Answer, options: Namespace) -> None:
             print(f"\n{table}")
             if text := legend(answer.history):
                 print(f"\n{text}")
-    if record.verdict is Verdict.DECLINED:
+    if record.status is Verdict.DECLINED:
         say(f"{record.solver} declines {record.case}: {record.message}{_hint(answer)}")
 
 

@@ -232,7 +232,7 @@ def relative_ratio(c: Comparison, solver: str) -> Mean | None:
     None if no other solver has times.
     """
     competing = (p for p in c.pairs if p.after.solver != solver)
-    rivals = grouped((p for p in competing if not p.after.first.role), block_of)
+    rivals = grouped((p for p in competing if not p.after.first.arm), block_of)
     changes = []
     for p in c.of(solver):
         others = rivals.get(block_of(p), ())

@@ -122,14 +122,14 @@ def _unverified(c: Comparison, folders: int) -> tuple[str, ...]:
     """
     found = []
     for solver in c.solvers:
-        pairs = [p for p in c.of(solver) if not p.after.first.role]
+        pairs = [p for p in c.of(solver) if not p.after.first.arm]
         lacking = [
             str(evidence.directory)
             for evidence, outcomes in (
                 (c.before, [p.before for p in pairs]),
                 (c.after, [p.after for p in pairs]),
             )
-            if not any(r.verdict.is_verified for o in outcomes for r in o.records)
+            if not any(r.status.is_verified for o in outcomes for r in o.records)
         ]
         if pairs and len(lacking) == folders:
             where = " and in ".join(lacking)
@@ -159,7 +159,7 @@ def _why_not(c: Comparison) -> str:
 
 def _changes(c: Comparison) -> list[_Change]:
     """Return the changes of cells that have times and other solvers in both folders."""
-    timed = [p for p in c.timed if not p.after.first.role]
+    timed = [p for p in c.timed if not p.after.first.arm]
     rows = grouped(timed, lambda p: (*block_of(p), p.after.first.mode))
     found = []
     for row in rows.values():

@@ -22,7 +22,7 @@ def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
     message : message of the solver, shown on hovering
     """
     symbol, words = VERDICTS[outcome.verdict]
-    alike = sum(r.verdict is outcome.verdict for r in outcome.records)
+    alike = sum(r.status is outcome.verdict for r in outcome.records)
     if alike < len(outcome.records):
         words += f" ({alike} of {plural(len(outcome.records), 'repeat')})"
     return Cell(

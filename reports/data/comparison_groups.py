@@ -199,13 +199,13 @@ def all_groups(
 
     pool_forms : group by mode and accuracy only; each QP remains a separate case
     """
-    records = [r for r in evidence.records if not r.role]
+    records = [r for r in evidence.records if not r.arm]
     cells = _cells(evidence, pool_forms=pool_forms)
     time_limit = evidence.suite.get("time_limit")
     if isinstance(time_limit, int | float) and time_limit > 0:
         limit = float(time_limit)
     else:  # the longest measured time
-        every = (o for o in evidence.flat if not o.first.role)
+        every = (o for o in evidence.flat if not o.first.arm)
         limit = max((t for t in map(_seconds, every) if t > 0), default=1.0)
     groups = [_group(key, of, evidence.solvers, limit) for key, of in cells.items()]
     if len({r.session for r in records}) > 1:
@@ -229,7 +229,7 @@ def _cells(evidence: Evidence, *, pool_forms: bool) -> dict[GroupKey, Cells]:
     """Group outcomes by group key, case and solver; a tolerance sweep is one cell."""
     cells: dict[GroupKey, Cells] = {}
     for o in evidence.flat:
-        if not o.first.role:
+        if not o.first.arm:
             cases = cells.setdefault(group_key(o.first, pool_forms=pool_forms), {})
             cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
     return cells
@@ -336,9 +336,9 @@ def _cell(outcomes: Sequence[Outcome]) -> tuple[float, ...]:
     stopped = [
         np.inf if np.isnan(t) else t
         for t, o in times
-        if not o.verified and all(r.verdict in _LATE for r in o.records)
+        if not o.verified and all(r.status in _LATE for r in o.records)
     ]
-    declined = all(r.verdict is Verdict.DECLINED for o in outcomes for r in o.records)
+    declined = all(r.status is Verdict.DECLINED for o in outcomes for r in o.records)
     return (
         min(verified, default=np.inf),
         min(claimed, default=np.inf),

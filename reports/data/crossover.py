@@ -132,7 +132,7 @@ def memory(o: Outcome) -> Interval | None:
 
 def crossover_maps(evidence: Evidence) -> list[Map]:
     """Return a map for each series of three or more sizes in primal and dual forms."""
-    answers = [o for o in evidence.flat if not o.first.role and o.first.mode == "cold"]
+    answers = [o for o in evidence.flat if not o.first.arm and o.first.mode == "cold"]
     dofs = _dofs(answers)
     sized = [(n, o) for o in answers if (n := dofs.get(_mesh(o))) is not None]
     fixed = fixed_keys(sized, apart=DECOMPOSITION)

@@ -98,7 +98,7 @@ class Outcome:
     @cached_property
     def verdict(self) -> Verdict:
         """Worst verdict among the repeats."""
-        return min((r.verdict for r in self.records), key=SEVERITY.index)
+        return min((r.status for r in self.records), key=SEVERITY.index)
 
     @property
     def verified(self) -> bool:
@@ -376,7 +376,7 @@ def _warn_of_contradictions(
     wrong = []
     for r in records:
         values = [v for name in RESIDUALS if (v := getattr(r, name)) is not None]
-        if r.verdict is Verdict.VERIFIED and max(values, default=0) > allowed(
+        if r.status is Verdict.VERIFIED and max(values, default=0) > allowed(
             r.judged_at
         ):
             wrong.append(r.identity)
@@ -402,7 +402,7 @@ def _judged_and_labelled(record: Record, factor: float) -> Record:
     """Judge a record at `factor`; append its mode to the label unless it is cold."""
     changes: dict[str, Any] = {}
     if factor != VERIFIED_FACTOR:
-        changes["verdict"] = rejudged(record, factor)
+        changes["status"] = rejudged(record, factor)
     if record.mode != "cold":
         changes["solver"] = f"{record.solver} ({record.mode})"
     return record.replace(**changes) if changes else record

@@ -95,7 +95,7 @@ def strong_series(evidence: Evidence) -> list[StrongSeries]:
     for (case, tol), row in evidence.outcomes.items():
         by_ranks: dict[str, dict[int, Outcome]] = {}
         for o in row.values():
-            if o.verified and not o.first.role:
+            if o.verified and not o.first.arm:
                 by_ranks.setdefault(base_label(o), {})[o.first.ranks] = o
         series += [
             StrongSeries(
@@ -118,7 +118,7 @@ def weak_series(evidence: Evidence) -> list[WeakSeries]:
     """
     series = []
     for key, of in by_series(sized(evidence), base_label).items():
-        members = [Member(o.first.ranks, n, o) for n, o in of if not o.first.role]
+        members = [Member(o.first.ranks, n, o) for n, o in of if not o.first.arm]
         alone = [m for m in members if m.ranks == 1]
         for first in sorted(alone, key=lambda m: m.dofs):
             by_ranks = {1: [first]}

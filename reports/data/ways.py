@@ -53,7 +53,7 @@ def compare_ways(evidence: Evidence) -> Ways:
     """
     problems: dict[str, list[Record]] = {}
     for r in evidence.records:
-        if not r.role:
+        if not r.arm:
             problems.setdefault(r.case.removesuffix(f"/{r.form}"), []).append(r)
     differing = {
         name: records

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from mortarbench.harness import Record, Verdict
 from mortarbench.harness.files.csvfile import csv_text
-from mortarbench.harness.record import JOURNAL
+from mortarbench.harness.results.frame import frame_of, with_texts
 from mortarbench.reports.data.aggregation import (
     EVERY,
     USUAL,
@@ -28,7 +27,6 @@ from mortarbench.reports.data.environment import by_environment
 from mortarbench.reports.data.evidence import RESIDUALS, Evidence, Outcome
 from mortarbench.reports.data.quantities import spreads
 from mortarbench.reports.data.size_series import SizeSeries, size_series
-from mortarbench.reports.export.parquet import texts
 from mortarbench.reports.statistics.profiles import performance_ratios
 
 _COUNTS = ("iterations", "iterations_min", "iterations_max", "n", "m")
@@ -59,7 +57,7 @@ def csv_tables(
 def _tables(evidence: Evidence, *, pool_forms: bool) -> dict[str, pd.DataFrame]:
     """Return the tables of one environment."""
     tables = {
-        "measurements": _measurements(evidence.records),
+        "measurements": with_texts(frame_of(evidence.records)),
         "outcomes": pd.DataFrame(map(_outcome, evidence.flat)),
         "energies": pd.DataFrame(
             {
@@ -90,17 +88,6 @@ def _counted(frame: pd.DataFrame) -> pd.DataFrame:
     """Convert counts with missing values to nullable integers."""
     counts = [name for name in _COUNTS if name in frame]
     return frame.astype(dict.fromkeys(counts, "Int64"))
-
-
-def _measurements(records: Sequence[Record]) -> pd.DataFrame:
-    """Tabulate the fields of records, one column each; nested values are JSON text."""
-    columns = {
-        name: [getattr(r, f.name) for r in records] for name, f in JOURNAL.items()
-    }
-    for name, values in columns.items():
-        if isinstance(values[0], Mapping | Verdict):
-            columns[name] = list(texts(values))
-    return pd.DataFrame(columns)
 
 
 def _outcome(o: Outcome) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from mortarbench.harness import Record
-from mortarbench.harness.record import JOURNAL, finite
+from mortarbench.harness.record import finite
 from mortarbench.reports.document.figure import Figure
 from mortarbench.reports.document.formatting import VERDICTS, clean, tolerance
 from mortarbench.reports.document.layout import Cell, Page, Table, named, short
@@ -52,7 +52,9 @@ def details(records: Sequence[Record]) -> str:
     values and a list of indices.
     """
     lines = [_as_journalled(r) for r in records]
-    columns = {name: [getattr(r, f.name) for r in lines] for name, f in JOURNAL.items()}
+    columns = {
+        name: [getattr(r, name) for r in lines] for name in Record.__struct_fields__
+    }
     text = strict({name: _column(values) for name, values in columns.items()})
     return b64encode(gzip.compress(text.encode(), 5, mtime=0)).decode()
 
@@ -148,7 +150,7 @@ def _keys(records: Sequence[Record]) -> Data:
         "case": lambda r: clean(r.case),
         "tol": lambda r: tolerance(r.tol),
         "solver": lambda r: clean(r.solver, 40),
-        "status": lambda r: VERDICTS[r.verdict][1],
+        "status": lambda r: VERDICTS[r.status][1],
     }
     keys = {name: _coded([show(r) for r in records]) for name, show in shown.items()}
     return {"id": [short(r.identity) for r in records], **keys}

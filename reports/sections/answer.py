@@ -313,7 +313,7 @@ def _best_at(swept: Sweeps, error: float) -> str:
         times = {
             solver: time_at_accuracy(outcomes, error)
             for solver, outcomes in row.items()
-            if not outcomes[0].first.role
+            if not outcomes[0].first.arm
         }
         kinds = places(times)
         best = [s for s, kind in kinds.items() if kind == "best"]
@@ -361,7 +361,7 @@ def own_results(a: Analysis) -> Iterator[Statement | Picture]:
     Yield nothing unless exactly one solver (null arms aside) was run on one rank.
     """
     firsts = (o.first for o in a.evidence.flat)
-    cold = {r.solver for r in firsts if not r.role and r.ranks == 1}
+    cold = {r.solver for r in firsts if not r.arm and r.ranks == 1}
     if len(cold) != 1:
         return
     (solver,) = cold

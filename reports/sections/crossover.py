@@ -189,7 +189,7 @@ def _stops_table(one: Map) -> Table:
         ends = [
             f"{clean(o.solver, 24)}: {clean(r.message or o.verdict.words, 60)}"
             for o in one.stops[route].outcomes
-            for r in [next(r for r in o.records if r.verdict == o.verdict)]
+            for r in [next(r for r in o.records if r.status == o.verdict)]
             if not o.verified
         ]
         return Cell.words("; ".join(ends) or "–")

@@ -96,9 +96,9 @@ def claims(a: Analysis) -> Iterator[Part]:
         if not o.verified and o.verdict is not Verdict.DECLINED
     ]
     alike = grouped(
-        ended, lambda e: (e.record.solver, e.record.tol, e.record.verdict, e.why)
+        ended, lambda e: (e.record.solver, e.record.tol, e.record.status, e.why)
     )
-    refuted = [of for of in alike.values() if of[0].record.verdict in REFUTED]
+    refuted = [of for of in alike.values() if of[0].record.status in REFUTED]
     if refuted:
         columns = (
             ("case", _cases),
@@ -112,7 +112,7 @@ def claims(a: Analysis) -> Iterator[Part]:
         )
         caption = TEXT("refuted_caption")
         yield Table.of(caption, refuted, columns, text_columns=2)
-    others = [of for of in alike.values() if of[0].record.verdict not in REFUTED]
+    others = [of for of in alike.values() if of[0].record.status not in REFUTED]
     others.sort(key=len, reverse=True)
     yield from (Point(TEXT("ended", of[0], len(of))) for of in others[:_REASONS])
     if len(others) > _REASONS:
@@ -142,7 +142,7 @@ class _Ended(NamedTuple):
 
         row : outcomes of all solvers on the same case at the same tolerance
         """
-        record = next(r for r in o.records if r.verdict is o.verdict)
+        record = next(r for r in o.records if r.status is o.verdict)
         errors = {name: o.largest(name) for name in RESIDUALS}
         known = [(value, name) for name, value in errors.items() if value is not None]
         if not known:

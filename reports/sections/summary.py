@@ -57,10 +57,10 @@ def summary(a: Analysis) -> Iterator[Part]:
     mine = {s: [r for r in evidence.records if r.solver == s] for s in evidence.solvers}
 
     def measured(solver: str) -> Cell:
-        return Cell.number(sum(r.verdict is not Verdict.DECLINED for r in mine[solver]))
+        return Cell.number(sum(r.status is not Verdict.DECLINED for r in mine[solver]))
 
     def ended(verdicts: tuple[Verdict, ...], solver: str) -> Cell:
-        those = [r for r in mine[solver] if r.verdict in verdicts]
+        those = [r for r in mine[solver] if r.status in verdicts]
         if not those:
             return Cell.number(0, kind="none")
         symbol, kind = VERDICTS[verdicts[0]][0], verdicts[0].value
@@ -97,7 +97,7 @@ def _measurement_counts(evidence: Evidence) -> tuple[int, int, int, int]:
     If a solver declines a case, the journal has one line for all repeats. If the folder
     contains several environments, the suite does not define what is planned in each.
     """
-    made = sum(r.verdict is not Verdict.DECLINED for r in evidence.records)
+    made = sum(r.status is not Verdict.DECLINED for r in evidence.records)
     if evidence.places:
         declined = len(evidence.records) - made
         return made, made + declined, declined, 0

@@ -151,7 +151,7 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
     }
     kinds = {
         (case, error): places(
-            {s: t for s, t in of.items() if not swept[case][s][0].first.role}
+            {s: t for s, t in of.items() if not swept[case][s][0].first.arm}
         )
         for (case, error), of in times.items()
     }

@@ -66,7 +66,7 @@ def _charged_table(
     for row in charged:
         one = next(o for o in row.values() if o.dualising is not None)
         totals = {s: o.with_dualising for s, o in row.items() if o.verified}
-        ranked = [t.value for s, t in totals.items() if t and not row[s].first.role]
+        ranked = [t.value for s, t in totals.items() if t and not row[s].first.arm]
         kinds = {min(ranked, default=None): "best"}
         cells = (
             Cell.time(total, kind=kinds.get(total.value, ""), title=source(row[s]))
@@ -88,10 +88,10 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
         return Cell(text=ending, symbol=symbol, kind="quiet", title=title)
     if not outcome.verified:
         return Cell(text=seconds(interval), after=ending, kind="void", title=title)
-    if outcome.first.role:  # null arms do not compete
+    if outcome.first.arm:  # null arms do not compete
         return Cell.time(interval, title=title)
     rivals = [
-        o.seconds("total") for o in row.values() if o.verified and not o.first.role
+        o.seconds("total") for o in row.values() if o.verified and not o.first.arm
     ]
     fastest = min((i for i in rivals if i is not None), key=lambda i: i.value)
     if interval == fastest:
@@ -136,7 +136,7 @@ def ratios(a: Analysis) -> Iterator[Part]:
             estimate,
             symbol="≈" if tied else "",
             after="" if relative.paired else "unpaired",
-            kind="tied" if tied and not outcome.first.role else "",
+            kind="tied" if tied and not outcome.first.arm else "",
             title=source(outcome),
         )
 
@@ -149,7 +149,7 @@ def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:
     medians = {
         s: median(times)
         for s, o in row.items()
-        if o.verified and not o.first.role and (times := [*o.by_block.values()])
+        if o.verified and not o.first.arm and (times := [*o.by_block.values()])
     }
     return row[min(medians, key=lambda s: medians[s])] if medians else None
 
@@ -205,7 +205,7 @@ def _null_ratios(evidence: Evidence) -> list[_Twins]:
     """Compare every null arm with the solver that it repeats, within blocks."""
     twins = []
     for row in evidence.outcomes.values():
-        for null in (o for o in row.values() if o.first.role == "null"):
+        for null in (o for o in row.values() if o.first.arm == "null"):
             twin = row.get(null.solver.replace(NULL_SUFFIX, "", 1))
             if twin is not None and null.verified and twin.verified:
                 ratio = paired_ratio(null.by_block, twin.by_block)

@@ -766,7 +766,7 @@ def test_a_run_measures_in_workers_and_ends_in_a_summary_and_a_page(cli, pit):
     assert page == "out/pit/index.html"
     assert "12 measurements" in err.splitlines()
     assert err.splitlines()[-1].startswith("12/12 ")
-    statuses = {(r.solver, r.verdict) for r in read_journal(Path("out/pit"))}
+    statuses = {(r.solver, r.status) for r in read_journal(Path("out/pit"))}
     assert statuses == {
         ("times", "verified"), ("twice", "wrong"), ("near", "inaccurate")
     }  # fmt: skip
@@ -868,7 +868,7 @@ def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
         parse("well/n=2/primal", FAMILIES),
         SolverSpec(name="exact", label="exact"),
         options={}, tol=1e-8, repeat=0, environment="here",
-    ).replace(verdict=Verdict.VERIFIED)  # fmt: skip
+    ).replace(status=Verdict.VERIFIED)  # fmt: skip
 
     with display_on(terminal) as bar:
         bar.start(1234)

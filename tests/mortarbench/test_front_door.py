@@ -146,7 +146,7 @@ def test_a_run_is_a_table_of_its_journal(results, capfd):
     records = read_journal(results.folder)
 
     assert list(results.df["run_id"]) == [r.run_id for r in records]
-    assert list(results.df.columns) == list(records[0].to_dict())
+    assert list(results.df.columns) == list(mb.harness.Record.__struct_fields__)
     assert (results.df.query("solver == 'exact'").status == "verified").all()
     assert len(results) == len(results.df) == 6  # declined once, not twice
     pd.testing.assert_frame_equal(mb.load(results.folder).df, results.df)
@@ -346,7 +346,7 @@ def test_in_a_notebook_a_run_shows_a_bar_and_unverified_answers(monkeypatch, res
         sys.modules, "IPython.display", SimpleNamespace(display=display)
     )
     good = results.records[0]
-    bad = good.replace(verdict=Verdict.WRONG, solver="<osqp>")
+    bad = good.replace(status=Verdict.WRONG, solver="<osqp>")
 
     with shown(None) as progress:
         progress.start(2)

@@ -65,7 +65,7 @@ def test_verified_infeasibility_passes_a_strict_run(qps, tmp_path, capsys):
     found = mb.load(out)
     assert not found.refuted
     assert not found.failed
-    count = {r.verdict for r in found.records}
+    count = {r.status for r in found.records}
     assert count == {Verdict.VERIFIED, Verdict.VERIFIED_INFEASIBLE}
     for factor in (10.0, 0.01, 1e4):
         outcomes = read_evidence(out, factor).flat

@@ -35,7 +35,7 @@ def record(claimed, found, tol, **changes):
     status = verdict(claimed, found, changes.get("accuracy") or tol)
     made = Record(
         run_id="r", case="box/dual", family="box", params={}, form="dual", sizes={},
-        solver="a", options={}, tol=tol, repeat=0, block=0, verdict=status,
+        solver="a", options={}, tol=tol, repeat=0, block=0, status=status,
         claimed=claimed.value, **found._asdict(),
     )  # fmt: skip
     return Record.from_json(made.replace(**changes).to_json())
@@ -45,7 +45,7 @@ def record(claimed, found, tol, **changes):
 def test_factor_ten_reproduces_every_stored_status(claimed, found, tol):
     stored = record(claimed, found, tol)
 
-    assert rejudged(stored, VERIFIED_FACTOR) is stored.verdict
+    assert rejudged(stored, VERIFIED_FACTOR) is stored.status
 
 
 @given(
@@ -87,21 +87,21 @@ def test_a_sweep_is_verified_at_its_accuracy_not_at_the_tolerances():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"verdict": Verdict.MEMORY_LIMIT},  # an answer that exceeded the limit
-        {"verdict": Verdict.CRASHED, "claimed": None, "primal": None, "dual": None},
-        {"verdict": Verdict.TIME_LIMIT, "claimed": None},
+        {"status": Verdict.MEMORY_LIMIT},  # an answer that exceeded the limit
+        {"status": Verdict.CRASHED, "claimed": None, "primal": None, "dual": None},
+        {"status": Verdict.TIME_LIMIT, "claimed": None},
     ],
 )
 def test_verdicts_that_do_not_depend_on_residuals_are_unchanged(changes, factor):
     stored = record(Status.SOLVED, Residuals(0, 1e-9, 0, 0), 1e-6).replace(**changes)
 
-    assert rejudged(stored, factor) is changes["verdict"]
+    assert rejudged(stored, factor) is changes["status"]
 
 
 def test_an_answer_without_a_claim_of_success_keeps_the_name_of_its_failure():
     stored = record(Status.ITERATION_LIMIT, Residuals(0, 5e-6, 0, 0), 1e-6)
 
-    assert stored.verdict is Verdict.VERIFIED
+    assert stored.status is Verdict.VERIFIED
     assert rejudged(stored, 1) is Verdict.ITERATION_LIMIT
 
 
@@ -122,7 +122,7 @@ def folder(tmp_path):
 def test_a_verdict_that_contradicts_its_residuals_is_reported(tmp_path, capsys):
     changed = record(Status.SOLVED, Residuals(0, 0.5, 0, 0), 1e-6)
     with Journal(tmp_path, "test") as journal:
-        journal.append(changed.replace(verdict=Verdict.VERIFIED))
+        journal.append(changed.replace(status=Verdict.VERIFIED))
     read_evidence(tmp_path)
 
     message = capsys.readouterr().err
@@ -161,7 +161,7 @@ def test_the_journal_and_its_table_keep_the_status_as_stored(folder):
     write_report(folder, ["parquet"], 0.1)
 
     assert pd.read_parquet(folder / "report/records.parquet").status[0] == "verified"
-    assert read_journal(folder)[0].verdict is Verdict.VERIFIED
+    assert read_journal(folder)[0].status is Verdict.VERIFIED
 
 
 def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch):
@@ -189,9 +189,9 @@ def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch)
                         (r.primal, r.dual, r.complementarity, r.gap))),
             r.tol,
         )
-        is r.verdict
+        is r.status
         for r in records
     }  # fmt: skip
 
     assert found == {True}
-    assert {Verdict.VERIFIED, Verdict.DECLINED} < {r.verdict for r in records}
+    assert {Verdict.VERIFIED, Verdict.DECLINED} < {r.status for r in records}

@@ -6,7 +6,6 @@ the upper end moves by 4p/E if the blocks are pressed together.
 """
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -120,7 +119,7 @@ def test_an_answer_has_the_remarks_on_the_input_too(tmp_path, capsys):
     ],
 )
 def test_a_weak_certificate_causes_a_remark(sound, bound, told):
-    record = replace(sound.record, energy_bound=bound)
+    record = sound.record.replace(energy_bound=bound)
     found = remarks(sound.case, record, sound.solution)
 
     assert [text.startswith(told) for text in found] == [True] * (told is not None)
@@ -136,7 +135,7 @@ def test_a_master_without_free_nodes_leaves_standard_output_to_results(tmp_path,
 
 
 def test_an_unverified_answer_has_no_remarks(sound):
-    record = replace(sound.record, verdict=Verdict.INACCURATE, energy_bound=np.inf)
+    record = sound.record.replace(status=Verdict.INACCURATE, energy_bound=np.inf)
 
     assert remarks(sound.case, record, sound.solution) == ()
 

@@ -92,7 +92,7 @@ def test_two_versions_are_measured_in_one_run_and_block(cli, versions, tmp_path)
     environment = json.loads(Path("out/mine/environment.json").read_text())
 
     assert code == 0, err
-    assert {s: (str(r.verdict), r.iterations) for s, r in records.items()} == {
+    assert {s: (str(r.status), r.iterations) for s, r in records.items()} == {
         "old:mine": ("wrong", 2), "new:mine": ("verified", 1),
         "exact": ("verified", None),
     }  # fmt: skip
@@ -135,7 +135,7 @@ def test_options_of_the_command_line_are_swept_and_measured_again(cli, versions)
     records = {r.solver: r for r in read_journal(Path("out/mine"))}
 
     assert code == 0, err
-    assert {s: (str(r.verdict), r.options) for s, r in records.items()} == {
+    assert {s: (str(r.status), r.options) for s, r in records.items()} == {
         "new:mine factor=1.0": ("verified", {"factor": 1.0}),
         "new:mine factor=2.0": ("wrong", {"factor": 2.0}),
     }
@@ -240,7 +240,7 @@ def test_a_new_suite_runs(starting):
     starting("new", "suite", "mine")
 
     assert starting("run", "mine.toml", "--repeats", "1")[0] == 0
-    assert {str(r.verdict) for r in read_journal(Path("out/mine"))} <= {
+    assert {str(r.status) for r in read_journal(Path("out/mine"))} <= {
         "verified", "declined", "inaccurate"
     }  # fmt: skip
 

@@ -29,7 +29,7 @@ def record(solver="a", tol=1e-6, repeat=0, **changes):
         run_id=f"{solver}-{tol}-{repeat}-{changes.get('case', 'box/dual')}",
         case="box/dual", family="box", params={}, form="dual", sizes={},
         solver=solver, options={}, tol=tol, repeat=repeat, block=repeat,
-        verdict=Verdict.VERIFIED, claimed="solved", total_seconds=0.01, primal=1e-9,
+        status=Verdict.VERIFIED, claimed="solved", total_seconds=0.01, primal=1e-9,
         dual=1e-9, complementarity=1e-9, gap=1e-9, energy_bound=tol,
         started="2026-11-21T06:00:00.000+00:00",
     )  # fmt: skip
@@ -105,11 +105,11 @@ def test_two_tolerances_with_one_answer_are_one_point():
 @pytest.mark.parametrize(
     "ending",
     [
-        dict(verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
-        dict(verdict=Verdict.TIME_LIMIT, claimed="time_limit"),
-        dict(verdict=Verdict.FAILED, claimed="failed"),
-        dict(verdict=Verdict.CRASHED, claimed=None, energy_bound=None),
-        dict(verdict=Verdict.MEMORY_LIMIT),
+        dict(status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
+        dict(status=Verdict.TIME_LIMIT, claimed="time_limit"),
+        dict(status=Verdict.FAILED, claimed="failed"),
+        dict(status=Verdict.CRASHED, claimed=None, energy_bound=None),
+        dict(status=Verdict.MEMORY_LIMIT),
         dict(energy_bound=None),
     ],
 )
@@ -122,14 +122,14 @@ def test_only_certified_answers_of_completed_solves_are_points(ending):
 
 def test_one_failed_repeat_removes_the_point():
     records = sweep()
-    records[-1] = records[-1].replace(verdict=Verdict.FAILED, claimed="failed")
+    records[-1] = records[-1].replace(status=Verdict.FAILED, claimed="failed")
 
     assert time_at_accuracy(outcomes(records), 1e-7).kind == "not reached"
 
 
 def test_a_certified_error_counts_though_the_residuals_refute_the_claim():
     """This occurs at loose tolerances of a sweep judged at a strict accuracy."""
-    refuted = [r.replace(verdict=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
+    refuted = [r.replace(status=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
 
     assert time_at_accuracy(outcomes(refuted), 1e-5).kind == "between"
 
@@ -218,7 +218,7 @@ def test_intervals_that_overlap_are_marked_at_matched_errors(page):
 
 
 def test_a_null_arm_does_not_compete_at_matched_errors(page):
-    null = sweep("a null", lambda tol: 0.5e-3 * tol**-0.25, repeats=6, role="null")
+    null = sweep("a null", lambda tol: 0.5e-3 * tol**-0.25, repeats=6, arm="null")
     found, *_ = tables(page([*sweep(repeats=6), *null]), "accuracy")
 
     assert {row["a"].kind for row in found} == {"best"}
@@ -229,7 +229,7 @@ def test_the_table_states_why_there_is_no_time(page):
     direct = sweep("direct", repeats=2, energy_bound=1e-12)
     weak = [r for r in sweep("weak") if r.tol > 1e-5]
     none = dict(claimed="declined", energy_bound=None, total_seconds=None)
-    refusing = [record("c", tol, verdict=Verdict.DECLINED, **none) for tol in TOLS]
+    refusing = [record("c", tol, status=Verdict.DECLINED, **none) for tol in TOLS]
     found, *_ = tables(page([*sweep(), *direct, *weak, *refusing]), "accuracy")
     last = found[-1]
 
@@ -267,7 +267,7 @@ def test_two_tolerances_are_not_a_sweep(page):
 
 def test_the_curve_joins_certified_points_and_others_are_hollow():
     records = [
-        r.replace(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
+        r.replace(claimed="iteration_limit", status=Verdict.ITERATION_LIMIT)
         if r.tol == 1e-8 else r
         for r in sweep()
     ]  # fmt: skip

@@ -43,7 +43,7 @@ def measured():
             form=form, sizes={"variables": 14, "equalities": 3, "inequalities": 0,
                               "bounds": 10},
             solver=solver, options={}, tol=1e-8, repeat=repeat, block=repeat,
-            verdict=Verdict.VERIFIED, claimed="solved", iterations=7,
+            status=Verdict.VERIFIED, claimed="solved", iterations=7,
             prepare_seconds=0.001, solve_seconds=0.002, total_seconds=0.003,
             primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11,
             quantities=ELASTIC, environment="abc",
@@ -172,7 +172,7 @@ def test_physical_results_are_of_the_answer_with_smallest_residual(measured, pag
         measured("tight", dual=9e-9, quantities=ELASTIC | {"tip": [1.0, 1.0]}),
         measured("best", tol=1e-6, dual=3e-9, quantities=ELASTIC | {"tip": [2.0, 2.0]}),
         measured("liar", dual=0.0, primal=0.0, gap=0.0, complementarity=0.0,
-                 verdict=Verdict.WRONG),
+                 status=Verdict.WRONG),
     ]  # fmt: skip
     (row,) = rows(section(page(records), "physics").tables[1])
     assert row["tip x in m"].value == 2.0
@@ -183,7 +183,7 @@ def test_active_rows_on_which_answers_differ_are_a_range(measured, page):
     records = [
         measured("a", quantities=ELASTIC | {"active": 5}),
         measured("b", dual=1e-9, quantities=ELASTIC | {"active": 6}),
-        measured("c", quantities=ELASTIC | {"active": 9}, verdict=Verdict.WRONG),
+        measured("c", quantities=ELASTIC | {"active": 9}, status=Verdict.WRONG),
     ]
     table = section(page(records), "physics").tables[1]
     assert rows(table)[0]["active"].text == "5–6"
@@ -207,7 +207,7 @@ def test_each_symbol_has_one_meaning(measured, page):
     times = {"fast": (1, 2, 3), "tied": (2, 3, 4), "bad": (1, 2, 3)}
     records = [
         measured(s, i, total_seconds=t / 1000,
-                 verdict=Verdict.INACCURATE if s == "bad" else Verdict.VERIFIED)
+                 status=Verdict.INACCURATE if s == "bad" else Verdict.VERIFIED)
         for s, ts in times.items() for i, t in enumerate(ts)
     ]  # fmt: skip
     made = page(records)
@@ -226,7 +226,7 @@ def test_a_busy_machine_is_flagged_in_the_summary(measured, page, load, said):
 def test_unequal_numbers_of_repeats_are_mentioned(measured, page):
     three = [measured("a", i) for i in range(3)]
     ten = [measured("b", i) for i in range(10)]
-    declined = [measured("c", verdict=Verdict.DECLINED)]
+    declined = [measured("c", status=Verdict.DECLINED)]
     equal = " ".join(section(page(three + declined), "summary").prose)
     assert "unequal" not in equal
     assert "3 to 10" in " ".join(section(page(three + ten), "summary").prose)
@@ -235,7 +235,7 @@ def test_unequal_numbers_of_repeats_are_mentioned(measured, page):
 def test_declined_cases_do_not_count_as_measurements(measured, page):
     records = [
         *(measured("a", i) for i in range(3)),
-        measured("shy", verdict=Verdict.DECLINED, total_seconds=None),
+        measured("shy", status=Verdict.DECLINED, total_seconds=None),
     ]
     made = section(page(records, suite={"repeats": 3}), "summary")
     assert made.prose[0].startswith(
@@ -259,7 +259,7 @@ def test_the_energy_bound_is_explained_only_where_there_is_one(measured, page):
 
 def test_without_points_there_is_no_table_of_residuals(measured, page):
     none = dict.fromkeys(("primal", "dual", "complementarity", "gap"))
-    lost = measured(verdict=Verdict.CRASHED, claimed=None, **none)
+    lost = measured(status=Verdict.CRASHED, claimed=None, **none)
     found = section(page([lost]), "errors")
 
     assert found.tables == ()
@@ -376,10 +376,10 @@ def test_a_wide_table_scrolls_with_a_fixed_first_column(measured, tmp_path):
 def test_every_refuted_claim_is_listed_with_its_evidence(measured, page):
     records = [
         measured("sound"),
-        measured("hasty", verdict=Verdict.INACCURATE, gap=3e-6, message="Optimal"),
-        measured("blind", verdict=Verdict.INFEASIBLE_CLAIM, claimed="infeasible",
+        measured("hasty", status=Verdict.INACCURATE, gap=3e-6, message="Optimal"),
+        measured("blind", status=Verdict.INFEASIBLE_CLAIM, claimed="infeasible",
                  primal=None, dual=None, complementarity=None, gap=None),
-        measured("modest", verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
+        measured("modest", status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
     ]  # fmt: skip
     _, refuted = section(page(records), "verdicts").tables
     listed = {row["solver"].text: row for row in rows(refuted)}
@@ -394,8 +394,8 @@ def test_the_objective_of_an_unverified_answer_is_compared_with_the_others(
     measured, page
 ):
     """The planted optimum is −2; other objectives are relative to the larger value."""
-    wrong = {"verdict": Verdict.WRONG, "gap": 3e-3}
-    late = {"verdict": Verdict.ITERATION_LIMIT, "claimed": "iteration_limit"}
+    wrong = {"status": Verdict.WRONG, "gap": 3e-3}
+    late = {"status": Verdict.ITERATION_LIMIT, "claimed": "iteration_limit"}
     records = [
         measured("sound", objective=-2.0),
         measured("rough", objective=-2.1, gap=9e-8),  # verified, but less accurate
@@ -419,8 +419,8 @@ def test_the_objective_of_an_unverified_answer_is_compared_with_the_others(
 
 
 def test_identical_failures_are_one_line(measured, page):
-    lost = {"verdict": Verdict.CRASHED, "claimed": None, "message": "SIGSEGV"}
-    blind = {"verdict": Verdict.WRONG, "message": "NaN in z"}
+    lost = {"status": Verdict.CRASHED, "claimed": None, "message": "SIGSEGV"}
+    blind = {"status": Verdict.WRONG, "message": "NaN in z"}
     nothing = dict.fromkeys(("primal", "dual", "complementarity", "gap"))
     records = [
         measured(solver, physical=f"beam-ring/n={n}", **end, **nothing)
@@ -456,7 +456,7 @@ def test_a_scaling_figure_grows_with_its_legend(measured, tmp_path):
 def test_refuted_claims_are_listed_with_the_common_accuracy(measured, page):
     """At tolerance 1e-4 and accuracy 1e-6, a residual of 5e-5 exceeds 1e-5."""
     record = measured(
-        tol=1e-4, accuracy=1e-6, gap=5e-5, verdict=Verdict.INACCURATE, primal=0.0
+        tol=1e-4, accuracy=1e-6, gap=5e-5, status=Verdict.INACCURATE, primal=0.0
     )
     tables = [table for part in page([record]).sections for table in part.tables]
     (row,) = (r for table in tables for r in rows(table) if "evidence" in r)

@@ -60,7 +60,7 @@ def _record(out, i, solver, history, changes):
         run_id=f"run-{i}", case=f"beam-ring/size={size}/dual", family="beam-ring",
         params={"size": size}, form="dual", sizes={"variables": size}, solver=solver,
         options={"history": True}, tol=1e-6, repeat=0, block=0,
-        verdict=Verdict.VERIFIED, claimed="solved", iterations=7, total_seconds=0.003,
+        status=Verdict.VERIFIED, claimed="solved", iterations=7, total_seconds=0.003,
         prepare_seconds=0.001, solve_seconds=0.002, environment="abc",
         primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11,
         vectors=save_solution(out, point), started="2026-11-21T10:00:00+00:00",
@@ -191,7 +191,7 @@ def test_iterations_are_the_axis_unless_all_solvers_count_products(folder):
 def test_each_solver_has_its_colour_and_an_unverified_one_its_verdict(folder):
     out = folder(
         ("a", KNOWN, {}), ("silent", {}, {}),
-        ("stuck", KNOWN, {"verdict": Verdict.ITERATION_LIMIT}),
+        ("stuck", KNOWN, {"status": Verdict.ITERATION_LIMIT}),
     )  # fmt: skip
     figure = convergence_figure(comparison(out))
     labels = [text.get_text() for text in figure.legends[0].get_texts()]

@@ -50,7 +50,7 @@ def report(request, tmp_path_factory, svg_only, blank):
                     run_id=f"{i}-{size}{name}", case=f"{name}/{size}", family=name,
                     params={name: size}, form=name, sizes={"variables": size},
                     solver=name, options={name: name}, tol=1e-6, repeat=0, block=0,
-                    verdict=Verdict.WRONG if i % 2 else Verdict.VERIFIED, claimed=name,
+                    status=Verdict.WRONG if i % 2 else Verdict.VERIFIED, claimed=name,
                     message=name, iterations=size, counts={name: 3},
                     total_seconds=size / 1e4, primal=1e-9, dual=1e-9, gap=1e-9,
                     complementarity=1e-9, quantities={"dofs": size, name: name},

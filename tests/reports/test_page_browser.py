@@ -268,20 +268,20 @@ def test_a_filter_shows_exactly_the_matching_rows(visit, folder, records):
 def test_the_verdict_filter_shows_exactly_the_matching_cases(visit, folder, records):
     page = visit(folder)
     page.select_option("#verdict", "inaccurate")
-    wanted = set(names(records, verdict=Verdict.INACCURATE))
+    wanted = set(names(records, status=Verdict.INACCURATE))
     assert 0 < len(wanted) < 50
     assert set(column(table(page, "verdicts"), "case")) == wanted
     assert set(column(table(page, "cases"), "case")) == wanted
     errors = table(page, "errors")
     found = zip(column(errors, "case"), column(errors, "solver"), strict=True)
     assert set(found) == {
-        (r.case, r.solver) for r in records if r.verdict is Verdict.INACCURATE
+        (r.case, r.solver) for r in records if r.status is Verdict.INACCURATE
     }
     toggle(page, "solver-a")  # rows with inaccurate answers of a are hidden
     wanted = {
         r.case
         for r in records
-        if r.verdict is Verdict.INACCURATE and r.solver != "solver-a"
+        if r.status is Verdict.INACCURATE and r.solver != "solver-a"
     }  # fmt: skip
     assert set(column(table(page, "verdicts"), "case")) == wanted
 
@@ -504,7 +504,7 @@ def compared(tmp_path_factory):
                         run_id=f"{i}-{repeat}", case="box/n=1/dual", family="box",
                         params={"n": 1}, form="dual", sizes={"variables": 10},
                         solver=solver, options={}, tol=1e-6, repeat=repeat,
-                        block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
+                        block=repeat, status=Verdict.VERIFIED, claimed="solved",
                         iterations=7, total_seconds=1e-3 * (1 + 0.01 * repeat * i),
                         primal=1e-9, dual=1e-9, complementarity=1e-9, gap=1e-9,
                         started="2026-11-21T10:00:00+00:00",
@@ -614,7 +614,7 @@ def hostile(tmp_path_factory):
                     family=text, params={text: size}, form="dual", solver=text,
                     sizes={"variables": size}, options={text: text}, tol=1e-6,
                     repeat=0, block=0, claimed=text, message=text,
-                    verdict=Verdict.WRONG if i % 2 else Verdict.VERIFIED,
+                    status=Verdict.WRONG if i % 2 else Verdict.VERIFIED,
                     iterations=size, counts={text: 3}, total_seconds=1e-3 * size,
                     primal=1e-9, dual=1e-9, complementarity=1e-9, gap=1e-9,
                     quantities={"dofs": size, text: text}, environment=text,

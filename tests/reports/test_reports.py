@@ -53,7 +53,7 @@ def measured():
             case=f"beam-ring/size={size}/{form}", family="beam-ring",
             params={"size": size}, form=form, sizes={"variables": size},
             solver=solver, options={"max_iter": 100}, tol=1e-8, repeat=repeat,
-            block=repeat, verdict=Verdict.VERIFIED, claimed="solved", iterations=7,
+            block=repeat, status=Verdict.VERIFIED, claimed="solved", iterations=7,
             prepare_seconds=0.001, solve_seconds=0.002, total_seconds=0.003,
             primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11,
             quantities={"dofs": 2 * size, "equality_rows": 4, "contact_rows": size,
@@ -98,7 +98,7 @@ def timed(measured, solver, times, **changes):
 def test_an_unverified_answer_is_never_the_fastest(measured, evidence):
     records = [
         *timed(measured, "honest", [0.030, 0.031, 0.032]),
-        *timed(measured, "liar", [0.001, 0.001, 0.001], verdict=Verdict.WRONG),
+        *timed(measured, "liar", [0.001, 0.001, 0.001], status=Verdict.WRONG),
     ]
     (row,) = table(compose(evidence(records)), "times")
     assert row["honest"].kind == "best"
@@ -108,7 +108,7 @@ def test_an_unverified_answer_is_never_the_fastest(measured, evidence):
 
 def test_one_unverified_repeat_voids_the_time(measured, evidence):
     records = timed(measured, "a", [0.01, 0.01, 0.01])
-    records[1] = records[1].replace(verdict=Verdict.INACCURATE)
+    records[1] = records[1].replace(status=Verdict.INACCURATE)
     page = compose(evidence(records))
     assert table(page, "times")[0]["a"].kind == "void"
     assert table(page, "verdicts")[0]["a"].text == "inaccurate (1 of 3 repeats)"
@@ -159,11 +159,11 @@ def test_the_summary_names_solvers_and_cases_that_miss_the_tolerance(
 ):
     records = [
         measured("osqp", 10),
-        measured("osqp", 20, verdict=Verdict.INACCURATE, dual=4e-6),
-        measured("osqp", 40, verdict=Verdict.TIME_LIMIT, claimed=None, dual=None),
+        measured("osqp", 20, status=Verdict.INACCURATE, dual=4e-6),
+        measured("osqp", 40, status=Verdict.TIME_LIMIT, claimed=None, dual=None),
         measured("good", 10),
         measured("good", 20, claimed="failed"),
-        measured("shy", 10, verdict=Verdict.DECLINED, message="has rows"),
+        measured("shy", 10, status=Verdict.DECLINED, message="has rows"),
     ]
     found = evidence(records)
     assert sentences(found, "osqp") == [
@@ -185,7 +185,7 @@ def test_the_summary_names_solvers_and_cases_that_miss_the_tolerance(
 
 
 def test_each_tolerance_has_a_separate_sentence(measured, evidence):
-    found = evidence([measured("a"), measured("a", tol=1e-4, verdict=Verdict.WRONG)])
+    found = evidence([measured("a"), measured("a", tol=1e-4, status=Verdict.WRONG)])
     loose, tight = sentences(found, "a")
     assert "wrong on 1 of 1 case at tol 1e-4" in loose
     assert "verified on its only case at tol 1e-8" in tight
@@ -206,7 +206,7 @@ def test_energies_are_compared_across_solvers_and_forms(measured, evidence):
             with_energy("a", "dual", -100.0),
             with_energy("a", "primal", -100.0 - 3e-5),
             with_energy("b", "dual", -100.0 + 1e-5),
-            with_energy("c", "dual", -90.0, verdict=Verdict.WRONG),
+            with_energy("c", "dual", -90.0, status=Verdict.WRONG),
             with_energy("d", "dual", -90.0, tol=1e-2),
         ]
     )
@@ -240,7 +240,7 @@ def grown(measured, solver, power, **changes):
 
 def test_a_planted_exponent_is_found_from_the_records(measured, evidence):
     records = [*grown(measured, "a", 1.5), *grown(measured, "b", 1.0)]
-    liar = measured("a", 900, total_seconds=1e-9, verdict=Verdict.WRONG)
+    liar = measured("a", 900, total_seconds=1e-9, status=Verdict.WRONG)
     (series,) = size_series(evidence([*records, liar]))
     assert series.time_law("a").exponent == pytest.approx(1.5)
     assert series.time_law("b").exponent == pytest.approx(1.0)
@@ -463,7 +463,7 @@ def test_the_largest_verified_case_is_drawn(measured, square, tmp_path):
     records = [
         measured("a", 10, fields=digest),
         measured("a", 30, fields=digest),
-        measured("a", 90, fields=digest, verdict=Verdict.INACCURATE),
+        measured("a", 90, fields=digest, status=Verdict.INACCURATE),
     ]
     page = compose(Evidence(directory=tmp_path, records=arrange(records)))
     (picture,) = (p for s in page.sections if s.name == "deformed" for p in s.pictures)

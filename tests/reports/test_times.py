@@ -1,7 +1,6 @@
 """Sections on times: dualisation, null arms, canaries and time to accuracy."""
 
 import re
-from dataclasses import replace
 
 import pytest
 
@@ -18,7 +17,7 @@ def record():
             f"{repeat}",
             case=f"box/{changes.get('form', 'dual')}", family="box", params={},
             form="dual", sizes={}, solver=solver, options={}, tol=1e-6,
-            repeat=repeat, block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
+            repeat=repeat, block=repeat, status=Verdict.VERIFIED, claimed="solved",
             total_seconds=0.01, primal=1e-9, dual=1e-9, complementarity=1e-9,
             gap=1e-9, started=f"2026-11-21T06:00:{repeat:02d}.000+00:00",
         )  # fmt: skip
@@ -59,7 +58,7 @@ def test_only_dual_forms_include_dualisation(record, section):
 
 
 def test_an_unverified_answer_has_no_total_with_dualising(record, section):
-    wrong = record("b", verdict=Verdict.WRONG, dualise_seconds=0.04)
+    wrong = record("b", status=Verdict.WRONG, dualise_seconds=0.04)
     _, charged = section([record(dualise_seconds=0.04), wrong], "times").tables
     assert rows(charged)[0]["b"].value is None
 
@@ -69,7 +68,7 @@ def test_a_null_arm_is_paired_with_its_solver(record, section, factor, held):
     noise = [0.98, 1.02, 1.0, 1.01, 0.99]
     plain = [record(repeat=i, total_seconds=0.01) for i in range(5)]
     null = [
-        record("a (A/A)", i, role="null", total_seconds=0.01 * factor * e)
+        record("a (A/A)", i, arm="null", total_seconds=0.01 * factor * e)
         for i, e in enumerate(noise)
     ]
     found = section(plain + null, "precision")
@@ -82,7 +81,7 @@ def test_a_null_arm_is_paired_with_its_solver(record, section, factor, held):
 
 def test_a_null_arm_does_not_win(record, section):
     records = [record(), record("b", total_seconds=0.02)]
-    null = record("a (A/A)", role="null", total_seconds=0.009, dualise_seconds=0.1)
+    null = record("a (A/A)", arm="null", total_seconds=0.009, dualise_seconds=0.1)
     records = [r.replace(dualise_seconds=0.1) for r in records]
     for table in section([*records, null], "times").tables:
         (row,) = rows(table)
@@ -91,7 +90,7 @@ def test_a_null_arm_does_not_win(record, section):
 
 def test_null_arms_of_sequences_are_paired_with_sequences(record, section):
     records = [
-        record(f"a{arm} (sequence)", i, role="null" if arm else "", mode="sequence")
+        record(f"a{arm} (sequence)", i, arm="null" if arm else "", mode="sequence")
         for arm in ("", " (A/A)")
         for i in range(3)
     ]
@@ -102,11 +101,11 @@ def test_null_arms_of_sequences_are_paired_with_sequences(record, section):
 
 def test_time_to_accuracy_is_the_time_of_the_fastest_verified_answer(record, section):
     sweep = [
-        record(tol=1e-2, accuracy=1e-6, total_seconds=0.001, verdict=Verdict.WRONG),
+        record(tol=1e-2, accuracy=1e-6, total_seconds=0.001, status=Verdict.WRONG),
         record(tol=1e-4, accuracy=1e-6, total_seconds=0.002),
         record(tol=1e-6, accuracy=1e-6, total_seconds=0.003),
-        record("b", tol=1e-6, accuracy=1e-6, verdict=Verdict.WRONG),
-        record("c", tol=1e-6, accuracy=1e-6, verdict=Verdict.DECLINED, claimed=None),
+        record("b", tol=1e-6, accuracy=1e-6, status=Verdict.WRONG),
+        record("c", tol=1e-6, accuracy=1e-6, status=Verdict.DECLINED, claimed=None),
     ]
     found = section(sweep, "accuracy")
     (row,) = rows(found.tables[0])
@@ -118,7 +117,5 @@ def test_time_to_accuracy_is_the_time_of_the_fastest_verified_answer(record, sec
 
 
 def test_a_sweep_of_zero_residuals_can_be_drawn(record, section):
-    exact = replace(
-        record(accuracy=1e-6), primal=0.0, dual=0.0, complementarity=0.0, gap=0.0
-    )
+    exact = record(accuracy=1e-6, primal=0.0, dual=0.0, complementarity=0.0, gap=0.0)
     assert section([exact], "accuracy").pictures

@@ -1,7 +1,6 @@
 """Folders of several machines, sessions and QPs: machines and QPs are never mixed."""
 
 import json
-from dataclasses import replace
 from itertools import chain
 
 import numpy as np
@@ -32,7 +31,7 @@ COMMON = ("summary", "absent", "definitions")
 
 def records(factor, environment, session):
     """Yield measurements for every section that contains times."""
-    null = {"solver": "solver-a (A/A)", "role": "null"}
+    null = {"solver": "solver-a (A/A)", "arm": "null"}
     every = list(campaign(4, 20, 3))
     every += [
         r.replace(run_id=f"{r.run_id}null", **null)
@@ -47,7 +46,7 @@ def records(factor, environment, session):
     for r in chain(every, rank_records(scatter=0.02), routes(), swept, judged):
         times = {
             name: factor * value
-            for name in Record.__dataclass_fields__
+            for name in Record.__struct_fields__
             if name.endswith("_seconds")
             and isinstance(value := getattr(r, name), float)
         }
@@ -227,7 +226,7 @@ def test_two_qps_never_share_a_row(tmp_path):
     """A default changed between two sessions: a solver is faster on the new QP."""
     old = boxes("aaaaaaaaaaaa")
     new = [
-        replace(r, qp=f"beef{r.qp[4:-1]}9") if r.params["n"] == 3 else r
+        r.replace(qp=f"beef{r.qp[4:-1]}9") if r.params["n"] == 3 else r
         for r in boxes("bbbbbbbbbbbb", 0.01)
     ]
     merge([write(tmp_path / "a", old), write(tmp_path / "b", new)], tmp_path / "ab")
@@ -253,7 +252,7 @@ def test_a_changed_default_is_not_compared_with_the_old_one(tmp_path):
     """Canonical names omit defaults, but records contain them."""
     old = boxes("aaaaaaaaaaaa")
     new = [
-        replace(r, qp=f"beef{r.qp[4:]}", params={**r.params, "depth": 2})
+        r.replace(qp=f"beef{r.qp[4:]}", params={**r.params, "depth": 2})
         for r in boxes("bbbbbbbbbbbb")
     ]
     a, b = (write(tmp_path / n, of) for n, of in (("a", old), ("b", new)))

@@ -13,7 +13,7 @@ def box_record(solver, case, seconds=0.01, repeat=0, **changes):
     defaults = dict(
         run_id=f"{solver}-{name}-{tol}-{repeat}", case=name, family="box",
         params={"n": case}, form=form, sizes={}, solver=solver, options={}, tol=tol,
-        repeat=repeat, block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
+        repeat=repeat, block=repeat, status=Verdict.VERIFIED, claimed="solved",
         iterations=7, total_seconds=seconds, primal=1e-9, dual=1e-9,
         complementarity=1e-9, gap=1e-9, quantities={"dofs": 100 * (case + 1)},
     )  # fmt: skip

@@ -54,7 +54,7 @@ def _record(dofs, n, repeat, label, times):
         run_id=f"{dofs:06d}{n:02d}{repeat:02d}abcd",
         case=f"membranes/S={dofs // 1000}/dual", family="membranes",
         params={"S": dofs // 1000}, form="dual", solver=label, options={}, tol=1e-6,
-        repeat=repeat, block=repeat, session="one", verdict=Verdict.VERIFIED,
+        repeat=repeat, block=repeat, session="one", status=Verdict.VERIFIED,
         claimed="solved", iterations=20, counts={"P_products": 24, "cg": 14},
         sizes={"variables": dofs // 50, "equalities": 10, "inequalities": 0,
                "bounds": 10},

@@ -51,7 +51,7 @@ def _cell(random, solver, number, form, contact, step, Nr, repeats):
             sizes={"variables": n, "equalities": 9 * Nr, "inequalities": 6 * Nr,
                    "bounds": 0},
             options={"max_iter": 10000, "backend": "auto"}, block=repeat,
-            verdict=Verdict(status), claimed="solved" if verified else "failed",
+            status=Verdict(status), claimed="solved" if verified else "failed",
             message="" if verified else f"stopped at {worst:.1e}",
             iterations=10 + number + Nr, counts={"factorisations": Nr + number},
             reported={"solve_seconds": 0.7 * total},

@@ -61,7 +61,7 @@ def write(folder, answers, tol=1e-8):
         for label, text, answer in answers:
             record = record_of(text, label, tol)
             if isinstance(answer, Verdict):
-                journal.append(record.replace(verdict=answer, message="as it ended"))
+                journal.append(record.replace(status=answer, message="as it ended"))
                 continue
             case = cases.setdefault(text, built(text))
             record = record.replace(qp=qp_digest(case.qp, serialised=True))

@@ -91,7 +91,7 @@ def beside_a_witness(tmp_path_factory):
         name = secrets.token_hex(8)
         patch.setenv("WATCHED", name)
         bench = Bench(tmp_path_factory.mktemp("accidents"))
-        assert bench("witness").verdict is Verdict.VERIFIED
+        assert bench("witness").status is Verdict.VERIFIED
         alone = processes_of(name)
         assert len(alone) == 2  # worker and its parent
 
@@ -103,7 +103,7 @@ def beside_a_witness(tmp_path_factory):
                     0,
                     2,
                 )  # worker and its parent
-                assert bench("witness").verdict is Verdict.VERIFIED
+                assert bench("witness").status is Verdict.VERIFIED
                 return record
             finally:
                 bench.workers.pop(solver).close()
@@ -179,7 +179,7 @@ def test_a_failure_affects_only_its_own_verdict_and_leaves_no_process(
     hangs = verdict is Verdict.TIME_LIMIT
     record = beside_a_witness(solver, 1.0 if hangs else 30.0)
 
-    assert record.verdict is verdict, record.message
+    assert record.status is verdict, record.message
     assert re.search(message, record.message), record.message
     assert len(record.message) < 500
 
@@ -231,10 +231,10 @@ def check_neighbours(tmp_path, watched, careless):
     got = run_together(tmp_path, "witness", *careless, "honest")
 
     for neighbour in ("witness", "honest"):
-        found = [(r.verdict, r.message) for r in got[neighbour]]
+        found = [(r.status, r.message) for r in got[neighbour]]
         assert found == [(Verdict.VERIFIED, "")] * 2
     for solver in careless:
-        assert {r.verdict for r in got[solver]} == {OUTCOMES[solver][0]}
+        assert {r.status for r in got[solver]} == {OUTCOMES[solver][0]}
     assert processes_of(watched) == []
 
 
@@ -297,8 +297,8 @@ def test_a_process_that_ends_in_a_repetition_does_not_affect_the_verdict(
     monkeypatch.setattr(supervisor, "REPEAT_SECONDS", 0.5)
     record = bench(solver)
 
-    assert record.verdict is Verdict.VERIFIED
-    assert (record.inner_loops, record.untimed_loops, record.remembered) == (1, 0, None)
+    assert record.status is Verdict.VERIFIED
+    assert (record.inner, record.untimed, record.remembered) == (1, 0, None)
     assert record.message.startswith("solved only once, since a repeated solve ended: ")
 
 
@@ -317,7 +317,7 @@ def test_a_worker_killed_in_the_warm_up_is_replaced_without_a_loss(
     record = bench("killedoncewarmingup")
 
     assert (tmp_path / "killed").exists()
-    assert record.verdict is Verdict.VERIFIED
+    assert record.status is Verdict.VERIFIED
     assert record.threads is not None  # reported by the warm-up
 
 
@@ -332,7 +332,7 @@ def test_a_kill_for_lack_of_memory_is_attributed_to_a_solver_that_used_it(
         with pytest.raises(FaultError, match="SIGKILL: the machine ran out of memory"):
             bench("killsitself")
     else:
-        assert bench("killsitself").verdict is Verdict.MEMORY_LIMIT
+        assert bench("killsitself").status is Verdict.MEMORY_LIMIT
 
 
 def test_a_command_that_does_not_exist_is_a_fault(bench):
@@ -343,7 +343,7 @@ def test_a_command_that_does_not_exist_is_a_fault(bench):
 def test_a_plug_in_that_crashes_on_import_yields_the_verdict_crashed(bench):
     record = bench("honest", command=[sys.executable, "-c", "raise SystemExit(3)"])
 
-    assert record.verdict is Verdict.CRASHED
+    assert record.status is Verdict.CRASHED
 
 
 def test_a_log_that_cannot_be_written_is_a_fault(bench, tmp_path):
@@ -389,7 +389,7 @@ def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
     bench("honest")
     os.kill(bench.process("honest"), signal.SIGKILL)
 
-    assert bench("honest").verdict is Verdict.VERIFIED
+    assert bench("honest").status is Verdict.VERIFIED
 
 
 #: program that measures a hanging solver repeatedly, and prints the results
@@ -401,7 +401,7 @@ from tests.harness.processes.test_accidents import Bench
 bench = Bench(Path(sys.argv[1]))
 while True:
     record = bench("hangswithadaemon", time_limit=3600)
-    print(record.verdict, record.message, file=sys.stderr, flush=True)
+    print(record.status, record.message, file=sys.stderr, flush=True)
 """
 
 

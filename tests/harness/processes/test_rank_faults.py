@@ -61,14 +61,14 @@ def processes_of(mark):
 def test_a_rank_that_is_killed_in_a_product_is_named(measured):
     record = measured("product", "killed")
 
-    assert record.verdict == "crashed"
+    assert record.status == "crashed"
     assert KILLED in record.message
 
 
 def test_a_case_that_one_rank_cannot_build_fails_with_the_reason(measured):
     record = measured("build", "raises-after")
 
-    assert record.verdict == "failed"
+    assert record.status == "failed"
     assert RAISED in record.message
 
 
@@ -76,14 +76,14 @@ def test_an_exception_in_a_product_of_one_rank_reaches_the_solver(measured):
     """Rank 0 has computed the product, but no sum of it."""
     record = measured("product", "raises-after")
 
-    assert (record.verdict, record.claimed) == ("failed", "failed")
+    assert (record.status, record.claimed) == ("failed", "failed")
     assert RAISED in record.message
 
 
 def test_a_rank_that_cannot_certify_is_named_and_the_verdict_is_kept(measured):
     record = measured("certificate", "raises-after")
 
-    assert record.verdict == "verified"
+    assert record.status == "verified"
     assert f"no energy_bound: RankFailedError: {RAISED}" in record.message
     assert record.energy_bound is None
     assert record.quantities["dofs"] > 0
@@ -93,7 +93,7 @@ def test_a_rank_that_cannot_certify_is_named_and_the_verdict_is_kept(measured):
 def test_a_rank_that_hangs_while_it_builds_is_ended_at_the_time_limit(measured):
     record = measured("build", "hangs", limit=4)
 
-    assert record.verdict == "time_limit"
+    assert record.status == "time_limit"
     assert record.message == "build: killed after 4 s"
 
 
@@ -102,7 +102,7 @@ def test_a_rank_that_hangs_while_it_builds_is_ended_at_the_time_limit(measured):
 def test_a_killed_rank_ends_the_measurement_with_a_line_that_names_it(measured, stage):
     record = measured(stage, "killed")
 
-    assert record.verdict == "crashed"
+    assert record.status == "crashed"
     assert KILLED in record.message
     assert names_stage(record.message, stage)
 
@@ -113,7 +113,7 @@ def test_a_killed_rank_ends_the_measurement_with_a_line_that_names_it(measured, 
 def test_a_rank_that_exits_with_0_before_the_others_is_named(measured, stage, rank):
     record = measured(stage, "exits", rank=rank)
 
-    assert record.verdict == "crashed"
+    assert record.status == "crashed"
     assert f"rank {rank} of 2 ranks ended: exit code 0" in record.message
     assert names_stage(record.message, stage)
 
@@ -122,7 +122,7 @@ def test_a_rank_that_exits_with_0_before_the_others_is_named(measured, stage, ra
 def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured):
     record = measured("product", "prints")
 
-    assert record.verdict == "crashed"
+    assert record.status == "crashed"
     assert record.message.endswith(f"{KILLED} (signal 9)")
 
 
@@ -131,7 +131,7 @@ def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured):
 def test_a_hanging_rank_is_killed_in_every_stage(measured, stage):
     record = measured(stage, "hangs")
 
-    assert record.verdict == "time_limit"
+    assert record.status == "time_limit"
     assert f"killed after {LIMIT} s" in record.message
     assert names_stage(record.message, stage)
 
@@ -144,7 +144,7 @@ def test_a_rank_that_fails_while_others_wait_for_it_is_named(measured, stage, ra
     """The others wait in a sum, so that the failed rank ends the processes."""
     record = measured(stage, "raises", rank=rank)
 
-    assert record.verdict in ("failed", "crashed")
+    assert record.status in ("failed", "crashed")
     assert f"rank {rank} of 2: ValueError: planted" in record.message
 
 
@@ -153,7 +153,7 @@ def test_a_rank_that_fails_while_others_wait_for_it_is_named(measured, stage, ra
 def test_an_exception_on_all_ranks_is_the_message_of_the_solver(measured, stage):
     record = measured(stage, "raises", rank="all")
 
-    assert record.verdict == "failed"
+    assert record.status == "failed"
     assert "ValueError: planted" in record.message
 
 
@@ -163,7 +163,7 @@ def test_an_exception_on_all_ranks_is_the_message_of_the_solver(measured, stage)
 def test_a_failing_evaluation_does_not_affect_the_verdict(measured, stage, rank):
     record = measured(stage, "raises-after", rank=rank)
 
-    assert record.verdict == "verified"
+    assert record.status == "verified"
     assert "ValueError: planted" in record.message
     assert (record.energy_bound is None) == (stage == "certificate")
     assert (not record.quantities) == (stage == "quantities")
@@ -190,8 +190,8 @@ def test_the_memory_limit_is_for_the_sum_over_all_ranks(tmp_path):
     text = SUITE.format(repeats=1, limit=110)
     suite.write_text(text.replace("[2]", "[1, 2]"))
     found = {r.ranks: r for r in mb.run(suite, out=tmp_path / "out").records}
-    assert found[1].verdict == "verified"
-    assert found[2].verdict == "memory_limit"
+    assert found[1].status == "verified"
+    assert found[2].status == "memory_limit"
     assert "above the limit of 110 MiB" in found[2].message
 
 
@@ -215,7 +215,7 @@ def test_a_run_that_is_killed_while_ranks_measure_is_continued(tmp_path):
 
     assert journal_lines(out)[: len(before)] == before
     assert sorted(r.repeat for r in results.records) == [0, 1, 2]
-    assert {r.verdict for r in results.records} == {"verified"}
+    assert {r.status for r in results.records} == {"verified"}
     assert len({r.qp for r in results.records}) == 1
 
 

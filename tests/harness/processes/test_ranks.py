@@ -239,7 +239,7 @@ def path(tmp_path_factory):
 def test_a_suite_measures_solvers_of_operators_on_all_numbers_of_ranks(path):
     asked = {(r.solver, r.ranks) for r in path[1]}
     assert asked == {("smalbe", 1), ("smalbe ranks=2", 2), ("clarabel", 1)}
-    assert {r.verdict for r in path[1] if r.solver != "clarabel"} == {"verified"}
+    assert {r.status for r in path[1] if r.solver != "clarabel"} == {"verified"}
 
 
 def test_a_sequence_of_load_steps_is_warm_on_ranks(path):
@@ -274,7 +274,7 @@ def test_the_parent_judges_a_sequence_of_a_plug_in_on_ranks(tmp_path):
     (tmp_path / "mine.py").write_text(FILE)
     text = SUITE.replace('"smalbe", "clarabel"', '"mine"').replace("[1, 2]", "[2]", 1)
     records = run_suite(tmp_path, text, plugins=[tmp_path / "mine.py"]).records
-    assert [r.verdict for r in records] == ["verified"] * 3
+    assert [r.status for r in records] == ["verified"] * 3
     assert all(r.energy_bound <= 1e-5 for r in records)
 
 
@@ -285,9 +285,9 @@ def test_a_suite_declines_cases_with_fewer_subdomains_than_ranks(tmp_path):
     text = head + '[[problems]]\nfamily = "membranes"\nforms = ["dual"]\n'
     text += "params = { S = [1, 2], n = 2 }\n"
     found = {r.params["S"]: r for r in run_suite(tmp_path, text).records}
-    assert found[1].verdict == "declined"
+    assert found[1].status == "declined"
     assert "3 ranks for 2 subdomains" in found[1].message
-    assert found[2].verdict == "verified"
+    assert found[2].status == "verified"
 
 
 @pytest.mark.parametrize(

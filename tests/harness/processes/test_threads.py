@@ -50,7 +50,7 @@ def built(number):
 
 def ran(number):
     out = Path(tempfile.gettempdir()) / f"out-{number}"
-    return [[str(r.verdict), r.objective] for r in mb.run(suite, out=out).records]
+    return [[str(r.status), r.objective] for r in mb.run(suite, out=out).records]
 
 does = {"solve": solved, "build": built, "run": ran}
 

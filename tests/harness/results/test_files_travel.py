@@ -101,7 +101,7 @@ def test_a_copied_folder_can_be_validated_replayed_and_reported(here, svg_only):
 def test_a_run_in_a_copied_folder_continues(here):
     results = mb.run("run/suite.toml", out="run", repeats=2)
 
-    assert [r.verdict.value for r in results.records] == ["verified"] * 2
+    assert [r.status.value for r in results.records] == ["verified"] * 2
     assert {r.params["sha256"] for r in results.records} == {
         results.records[0].params["sha256"]
     }
@@ -357,7 +357,7 @@ def test_folders_of_the_user_called_files_are_left_alone(tmp_path, monkeypatch):
 
     results = mb.run("s.toml", out=".")
 
-    assert [r.verdict.value for r in results.records] == ["verified"]
+    assert [r.status.value for r in results.records] == ["verified"]
     assert (tmp_path / "files" / "qp.npz").is_symlink()
 
 

@@ -34,7 +34,7 @@ def record(path, **changes):
     given = dict(
         run_id="a1", case=f"file:{path}", family="file", params={"path": str(path)},
         form="qp", sizes={"variables": 2}, solver="clarabel", options={}, tol=1e-6,
-        repeat=0, block=0, verdict=Verdict.VERIFIED, claimed="solved", primal=0.0,
+        repeat=0, block=0, status=Verdict.VERIFIED, claimed="solved", primal=0.0,
         dual=0.0, gap=0.0, complementarity=0.0, total_seconds=1e-3, environment="e1",
     )  # fmt: skip
     return Record(**given | changes)

@@ -102,7 +102,7 @@ def test_the_same_solver_on_the_same_case_gets_the_same_verdict(cli, stored, sol
     assert code == 0
     assert told["reproduced"] is True
     assert told["now"]["run_id"] == told["then"]["run_id"] == then.run_id
-    assert told["now"]["status"] == then.verdict
+    assert told["now"]["status"] == then.status
     assert (told["same_qp"], told["same_options"], told["same_counts"]) == (True,) * 3
     assert told["environment"] == []
 
@@ -155,7 +155,7 @@ def rewrite(record, **changes):
 
 def test_another_verdict_is_reported_and_exits_with_1(cli, stored):
     then = stored["exact", 1, 0]
-    rewrite(then, verdict="wrong")
+    rewrite(then, status="wrong")
     code, out, _ = cli("replay", "done", then.run_id)
 
     assert code == 1

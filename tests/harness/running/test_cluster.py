@@ -134,7 +134,7 @@ def measured(folder):
     occurs twice.
     """
     records = read_journal(Path(folder))
-    found = {r.run_id: r.verdict for r in records}
+    found = {r.run_id: r.status for r in records}
     assert len(found) == len(records)
     return found
 

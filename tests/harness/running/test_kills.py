@@ -179,8 +179,8 @@ def check(tmp_path, events, seed, out=None, repeats=4):
 
     assert len({r.run_id for r in got}) == len(got)  # exactly once
     assert {r.run_id for r in got} == {r.run_id for r in whole}
-    verdicts = {r.run_id: r.verdict for r in whole}
-    changed = [r for r in got if r.verdict != verdicts[r.run_id]]
+    verdicts = {r.run_id: r.status for r in whole}
+    changed = [r for r in got if r.status != verdicts[r.run_id]]
     assert len(changed) <= 3 * events.count(
         kill_one
     )  # a killed worker affects at most the three steps of a sequence

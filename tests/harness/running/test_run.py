@@ -187,7 +187,7 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_valid(
         got = {r.solver: r for r in records if r.case == case}
         for solver in chosen:
             status, claimed, message = OUTCOMES[solver]
-            assert got[solver].verdict == status, (solver, case)
+            assert got[solver].status == status, (solver, case)
             assert claimed in (..., got[solver].claimed), (solver, case)
             assert message in (None, got[solver].message)
 
@@ -211,7 +211,7 @@ def test_a_verified_record_contains_costs_and_quantities(measure, tmp_path):
 def test_the_answer_to_another_problem_is_wrong(measure, tmp_path):
     measure(suite("answersanotherproblem", cases=[{"h": 0.5}, {"h": 1.0}]))
 
-    verdicts = [r.verdict for r in read_journal(tmp_path)]
+    verdicts = [r.status for r in read_journal(tmp_path)]
     assert verdicts == [Verdict.VERIFIED, Verdict.WRONG]
 
 
@@ -222,16 +222,14 @@ def test_a_record_contains_times_of_phases_threads_and_cpu(measure, tmp_path):
     slow = next(r for r in records if r.solver == "sleeps")
     # a solve that waited for its CPU is not timed in a loop; at least one of five did
     # not wait
-    quick = max(
-        (r for r in records if r.solver == "honest"), key=lambda r: r.inner_loops
-    )
-    assert (slow.inner_loops, slow.threads, slow.cpu) == (
+    quick = max((r for r in records if r.solver == "honest"), key=lambda r: r.inner)
+    assert (slow.inner, slow.threads, slow.cpu) == (
         1,
         1,
         fastest_first(os.sched_getaffinity(0))[0],
     )
     assert slow.solve_seconds >= 0.02
-    assert quick.inner_loops > 1  # far below a millisecond
+    assert quick.inner > 1  # far below a millisecond
     assert quick.total_seconds < 0.001
     assert min(quick.build_seconds, quick.recover_seconds) > 0
     assert quick.dualise_seconds is None
@@ -250,7 +248,7 @@ def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
 
     assert watched.total == len(records) == 12
     assert {r.mode for r in records} == {"sequence"}
-    assert {r.verdict for r in records} == {Verdict.VERIFIED}
+    assert {r.status for r in records} == {Verdict.VERIFIED}
     for repeat in (0, 1):
         chain = [r for r in records if (r.solver, r.repeat) == ("chains", repeat)]
         assert [(r.params["h"], r.iterations) for r in chain] == [
@@ -280,7 +278,7 @@ def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_pa
 
     for solver in ("chains", "honest"):
         steps = [r for r in records if r.solver == solver]
-        assert [str(r.verdict) for r in steps] == 2 * ["verified"] + 2 * ["declined"]
+        assert [str(r.status) for r in steps] == 2 * ["verified"] + 2 * ["declined"]
         assert "there is no further problem" in steps[2].message
     measure(asked)
     assert len(read_journal(tmp_path)) == 8  # no measurement is missing
@@ -290,7 +288,7 @@ def test_a_broken_sequence_names_the_step(measure, tmp_path):
     measure(three_steps("breaksitschain"))
 
     records = read_journal(tmp_path)
-    assert [r.verdict for r in records] == [
+    assert [r.status for r in records] == [
         Verdict.VERIFIED, Verdict.CRASHED, Verdict.CRASHED,
     ]  # fmt: skip
     assert records[2].message == "the sequence ended at tiny/plain: exit code 9"
@@ -311,7 +309,7 @@ def test_answers_of_a_sweep_are_verified_at_one_accuracy(measure, tmp_path):
     measure(sweep)
 
     records = read_journal(tmp_path)
-    assert {(r.tol, r.accuracy, r.solver, r.verdict) for r in records} == {
+    assert {(r.tol, r.accuracy, r.solver, r.status) for r in records} == {
         (0.1, 1e-6, "honest", Verdict.VERIFIED), (0.1, 1e-6, "zero", Verdict.WRONG),
         (1e-8, 1e-6, "honest", Verdict.VERIFIED), (1e-8, 1e-6, "zero", Verdict.WRONG),
     }  # fmt: skip
@@ -338,7 +336,7 @@ def test_a_damaged_case_on_disk_is_built_again(measure, tmp_path):
     built.write_bytes(whole[:-3] + b"bad")
     measure(suite("honest", repeats=2))
 
-    assert [r.verdict for r in read_journal(tmp_path)] == [Verdict.VERIFIED] * 2
+    assert [r.status for r in read_journal(tmp_path)] == [Verdict.VERIFIED] * 2
     assert built.read_bytes() == whole
 
 
@@ -355,7 +353,7 @@ def test_a_multiplier_of_the_wrong_sign_is_wrong(measure, tmp_path):
     measure(suite("honest", cases=[{"h": 3.0}]))
     (r,) = read_journal(tmp_path)
 
-    assert (r.verdict, r.claimed) == (Verdict.WRONG, "solved")
+    assert (r.status, r.claimed) == (Verdict.WRONG, "solved")
     assert r.primal == r.complementarity == r.gap == 0 < r.dual
     assert r.vectors is not None
     assert r.fields is None
@@ -513,7 +511,7 @@ def test_a_failing_evaluation_only_adds_a_note(measure, tmp_path, fault, note):
     measure(suite("honest", cases=[{"fault": fault}]))
     (r,) = read_journal(tmp_path)
 
-    assert (r.verdict, r.message) == (Verdict.VERIFIED, note)
+    assert (r.status, r.message) == (Verdict.VERIFIED, note)
     assert r.vectors is not None
 
 
@@ -682,7 +680,7 @@ def test_files_deleted_during_a_run_lose_no_measurement(measure, tmp_path, lost)
 
     records = once_each(tmp_path, 4)
     assert (len(watched.records), watched.skipped, watched.total) == (4, 0, 4)
-    assert {r.solver: r.verdict for r in records} == {
+    assert {r.solver: r.status for r in records} == {
         "honest": Verdict.VERIFIED, "zero": Verdict.WRONG,
     }  # fmt: skip
     assert watched.faults == []
@@ -738,7 +736,7 @@ def test_on_any_full_disk_a_run_ends_in_one_line_and_can_continue(
 
     assert said == {"free some space; the same command continues the run"}
     records = once_each(tmp_path, 2)
-    assert {r.verdict for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
+    assert {r.status for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
     assert writes > 6  # suite and environment need four writes
 
 
@@ -764,7 +762,7 @@ def test_a_full_disk_in_the_case_worker_or_worker_yields_no_verdict(
     assert read_journal(tmp_path) == []
 
     measure(whole)
-    assert {r.verdict for r in once_each(tmp_path, 2)} == {Verdict.VERIFIED}
+    assert {r.status for r in once_each(tmp_path, 2)} == {Verdict.VERIFIED}
 
 
 @pytest.fixture

@@ -97,7 +97,7 @@ def test_a_declined_case_is_not_offered_again():
         for (record,) in block.turns:
             asked.append(record.solver)
             verdict = Verdict.DECLINED if record.solver == "a" else Verdict.VERIFIED
-            schedule.add(record.replace(verdict=verdict, total_seconds=1.0))
+            schedule.add(record.replace(status=verdict, total_seconds=1.0))
 
     assert (asked.count("a"), asked.count("b")) == (1, 3)
 
@@ -174,7 +174,7 @@ def test_beyond_a_limit_only_larger_cases_are_skipped(sizes, last):
                 verdict = Verdict.TIME_LIMIT if n == 2 else Verdict.VERIFIED
             made[record.solver, n] += 1
             filled = {"variables": sizes[n - 1]}
-            schedule.add(record.replace(verdict=verdict, sizes=filled))
+            schedule.add(record.replace(status=verdict, sizes=filled))
 
     assert [made["b", n + 1] for n in range(len(sizes))] == [3] * len(sizes)
     assert [made["a", n + 1] for n in range(len(sizes))] == [
@@ -196,7 +196,7 @@ def test_a_limit_at_one_setting_does_not_skip_another_setting():
             at = (record.solver, n, record.tol)
             verdict = Verdict.MEMORY_LIMIT if at == ("a", 2, 1e-6) else Verdict.VERIFIED
             made[at] += 1
-            schedule.add(record.replace(verdict=verdict, sizes={"variables": n}))
+            schedule.add(record.replace(status=verdict, sizes={"variables": n}))
 
     assert [made["a", n, 1e-6] for n in range(1, 7)] == [3, 3, 0, 3, 3, 3]
     assert [made["a", n, 1e-3] for n in range(1, 7)] == [3] * 6

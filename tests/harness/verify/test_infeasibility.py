@@ -389,13 +389,13 @@ def test_no_bounded_objective_of_a_search_is_proven_unbounded(number):
 def record():
     return Record(
         run_id="r", case="c", family="f", params={}, form="primal", sizes={},
-        solver="s", options={}, tol=1e-8, repeat=0, block=0, verdict=Verdict.FAILED,
+        solver="s", options={}, tol=1e-8, repeat=0, block=0, status=Verdict.FAILED,
     )  # fmt: skip
 
 
 def judge_claim(qp, status):
     found = judged(record(), qp, Solution.without_point(qp, status))
-    return found.verdict, found.message
+    return found.status, found.message
 
 
 @pytest.mark.parametrize(
@@ -415,7 +415,7 @@ def judge_claim(qp, status):
 def test_true_claims_are_verified_and_false_ones_refuted(qp, claimed, expected):
     got = judged(record(), qp, Solution.without_point(qp, claimed))
 
-    assert got.verdict is expected
+    assert got.status is expected
     assert got.message or claimed not in (Status.INFEASIBLE, Status.UNBOUNDED)
     for factor in (1e-3, 1, 10, 1e6):
         assert rejudged(Record.from_json(got.to_json()), factor) is expected
@@ -425,9 +425,9 @@ def test_a_correct_claim_counts_despite_a_small_violation_of_its_point():
     """For x ≤ 1 and x ≥ 1 + 1e-9, x = 1 has residuals below the tolerance 1e-8."""
     qp = qp_of(G=[[1], [-1]], h=[1, -1 - 1e-9])
     point = at([1], z=[0, 2])
-    assert judged(record(), qp, point).verdict is Verdict.VERIFIED
+    assert judged(record(), qp, point).status is Verdict.VERIFIED
     claim = replace(point, status=Status.INFEASIBLE)
-    assert judged(record(), qp, claim).verdict is Verdict.VERIFIED_INFEASIBLE
+    assert judged(record(), qp, claim).status is Verdict.VERIFIED_INFEASIBLE
 
 
 def test_margins_below_rounding_prove_nothing():

@@ -349,7 +349,7 @@ def test_a_loose_tolerance_does_not_verify_a_refutation():
 def stored(claimed, expected, worst=5e-8):
     return Record(
         run_id="r", case="c/f", family="c", params={}, form="f", sizes={}, solver="s",
-        options={}, tol=1e-8, repeat=0, block=0, claimed=claimed, verdict=expected,
+        options={}, tol=1e-8, repeat=0, block=0, claimed=claimed, status=expected,
         **Residuals(0.0, worst, 0.0, 0.0)._asdict(),
     )  # fmt: skip
 

@@ -78,14 +78,14 @@ def test_a_declined_measurement_has_no_residuals():
     answer = Solution.without_point(QP_, Status.DECLINED, "bounds only")
     got = judged(record(), QP_, answer)
 
-    assert (got.verdict, got.claimed) == (Verdict.DECLINED, "declined")
+    assert (got.status, got.claimed) == (Verdict.DECLINED, "declined")
     assert (got.message, got.objective) == ("bounds only", None)
 
 
 def test_a_solution_is_verified_and_has_its_objective():
     got = judged(record(), QP_, POINT)
 
-    assert got.verdict is Verdict.VERIFIED
+    assert got.status is Verdict.VERIFIED
     assert got.objective == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
 
 
@@ -97,7 +97,7 @@ def test_the_accuracy_of_a_suite_overrides_the_tolerance(tol, accuracy, is_right
     near = replace(POINT, x=POINT.x + np.array([-1e-3, 1e-3]))
     got = judged(record(tol, accuracy=accuracy), QP_, near)
 
-    assert (got.verdict is Verdict.VERIFIED) == is_right
+    assert (got.status is Verdict.VERIFIED) == is_right
 
 
 @pytest.mark.parametrize("name", ["x", "y", "z", "z_box"])
@@ -171,7 +171,7 @@ def test_an_answer_is_judged_completely():
     """The ranks judge their answers by this function."""
     fields, notes = evaluated(case(lambda s: {"first": np.float64(0.25)}), POINT, 1e-8)
 
-    assert fields["verdict"] is Verdict.VERIFIED
+    assert fields["status"] is Verdict.VERIFIED
     assert fields["objective"] == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
     assert fields["quantities"] == {"first": 0.25}
     assert fields["recover_seconds"] >= 0
@@ -181,5 +181,5 @@ def test_an_answer_is_judged_completely():
 def test_quantities_that_fail_do_not_discard_the_judgement():
     fields, notes = evaluated(case(fault), POINT, 1e-8)
 
-    assert (fields["verdict"], fields["quantities"]) == (Verdict.VERIFIED, {})
+    assert (fields["status"], fields["quantities"]) == (Verdict.VERIFIED, {})
     assert "no quantities: ZeroDivisionError: two lines" in notes

@@ -457,7 +457,7 @@ def test_a_suite_takes_a_pattern_and_keeps_copies(tmp_path):
     run_id = results.df["run_id"].iloc[0]
     for seed in range(2):
         (tmp_path / f"{seed}.hdf5").unlink()
-    assert mb.replay(tmp_path / "out", run_id).now.verdict is mb.Verdict.VERIFIED
+    assert mb.replay(tmp_path / "out", run_id).now.status is mb.Verdict.VERIFIED
 
 
 def test_a_name_that_is_not_text_is_refused_in_one_line(tmp_path):

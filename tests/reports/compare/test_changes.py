@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -36,7 +35,7 @@ def record(solver="one", case=0, repeat=0, **changes):
         run_id=f"{solver}-{case}-{repeat}", case=f"box/n={case}/dual", family="box",
         params={"n": case}, form="dual", sizes={"variables": 10 + case}, solver=solver,
         options={"max_iter": 100}, tol=1e-6, repeat=repeat, block=repeat,
-        verdict=Verdict.VERIFIED, claimed="solved", iterations=7, total_seconds=0.01,
+        status=Verdict.VERIFIED, claimed="solved", iterations=7, total_seconds=0.01,
         primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11, objective=-0.5,
         quantities={"energy": -1234.5}, qp="abc", environment="e1",
         started="2026-11-21T10:00:00+00:00",
@@ -204,7 +203,7 @@ def test_repeats_of_two_sessions_are_unpaired_samples(changed):
 
 def test_times_of_unverified_answers_are_not_compared(changed):
     before = [record(repeat=i) for i in range(3)]
-    after = [r.replace(verdict=Verdict.WRONG, total_seconds=1e-6) for r in before]
+    after = [r.replace(status=Verdict.WRONG, total_seconds=1e-6) for r in before]
     c = changed(before, after)
 
     assert only(c).ratio is None
@@ -238,7 +237,7 @@ def test_a_solver_is_not_compared_with_its_null_arm(changed):
     def run(seed, **slower):
         first = [r for r in suite(seed, **slower) if r.solver != "three"]
         twin = [
-            replace(r, solver="one (A/A)", run_id=f"null-{r.run_id}", role="null")
+            r.replace(solver="one (A/A)", run_id=f"null-{r.run_id}", arm="null")
             for r in first
             if r.solver == "one"
         ]
@@ -376,7 +375,7 @@ def test_another_qp_under_the_same_name_is_flagged(changed):
 def test_worse_verdicts_are_listed_first(changed):
     before = suite(1, cases=2, repeats=3)
     after = [
-        r.replace(verdict=Verdict.INACCURATE) if r.run_id == "two-1-2" else r
+        r.replace(status=Verdict.INACCURATE) if r.run_id == "two-1-2" else r
         for r in suite(2, cases=2, repeats=3, three=3.0)
     ]
     c = changed(before, after)
@@ -415,7 +414,7 @@ def test_iterations_count_as_changed_if_ranges_do_not_overlap(
     ],
 )
 def test_verified_answers_that_differ_are_named(changed, energy, status, other):
-    after = record(quantities={"energy": energy}, verdict=status)
+    after = record(quantities={"energy": energy}, status=status)
     c = changed([record()], [after])
 
     assert only(c).other_answer is other
@@ -564,7 +563,7 @@ def test_a_qp_in_two_files_is_one_case(folders, changed):
 def test_a_worse_verdict_fails_even_if_times_cannot_be_compared(folders):
     slow = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
     worse = [
-        r.replace(verdict=Verdict.WRONG) if r.solver == "two" else r
+        r.replace(status=Verdict.WRONG) if r.solver == "two" else r
         for r in suite(2, cases=4, repeats=3)
     ]
     a, b = folders(HERE, slow, after=worse)
@@ -578,9 +577,7 @@ def test_a_worse_verdict_fails_even_if_times_cannot_be_compared(folders):
 def test_fail_on_names_solvers_without_verified_answers(folders):
     """One of the two solvers is wrong on all cases of the later folder."""
     pair = [r for r in suite(2, cases=4, repeats=3) if r.solver in ("one", "two")]
-    spoilt = [
-        r.replace(verdict=Verdict.WRONG) if r.solver == "two" else r for r in pair
-    ]
+    spoilt = [r.replace(status=Verdict.WRONG) if r.solver == "two" else r for r in pair]
     a, b = folders(HERE, HERE, before=pair, after=spoilt)
     with pytest.raises(InputError) as refused:
         report(a, b, formats=["csv"], fail_on=["slower"])

@@ -19,7 +19,7 @@ def record(solver, case, repeat, seconds, **changes):
     defaults = dict(
         run_id=f"{solver}-{case}-{repeat}", case=f"box/n={case}/dual", family="box",
         params={"n": case}, form="dual", sizes={}, solver=solver, options={}, tol=1e-6,
-        repeat=repeat, block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
+        repeat=repeat, block=repeat, status=Verdict.VERIFIED, claimed="solved",
         total_seconds=seconds, environment="e",
     )  # fmt: skip
     return Record(**(defaults | changes))
@@ -174,7 +174,7 @@ def test_the_reason_is_reported_if_nothing_can_be_judged(changed, tmp_path):
     def wrong(*solvers):
         def spoil(made):
             return [
-                r.replace(verdict=Verdict.WRONG) if r.solver in solvers else r
+                r.replace(status=Verdict.WRONG) if r.solver in solvers else r
                 for r in made
             ]
 
@@ -197,7 +197,7 @@ def test_a_solver_without_a_verified_answer_is_named(changed, tmp_path):
     rng = np.random.default_rng(141421)
     before, after = (session(rng, name, draw=normal) for name in "ab")
     spoilt = [
-        r.replace(verdict=Verdict.WRONG) if r.solver == "two" else r for r in after
+        r.replace(status=Verdict.WRONG) if r.solver == "two" else r for r in after
     ]
     found = regressions(c := changed(before, spoilt))
     named = f"two has no verified answer in {tmp_path / 'b'}: nothing to compare"

@@ -1,7 +1,6 @@
 """Sections on means, ranks, profiles, ratios, growth and claims, from records."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -139,7 +138,7 @@ def test_declined_forms_count_as_unsolved_if_forms_are_pooled(record, evidence):
         r for r in of_two_forms(record, 3) if (r.solver, r.form) != ("b", "dual")
     ]
     records += [
-        record("b", case, None, form="dual", verdict=Verdict.DECLINED, claimed=None)
+        record("b", case, None, form="dual", status=Verdict.DECLINED, claimed=None)
         for case in range(3)
     ]
     (found,) = comparison_groups(evidence(records), pool_forms=True)
@@ -182,7 +181,7 @@ def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidenc
     ]
     records += [
         record("b", case, 0.1, repeat,
-               verdict=Verdict.WRONG if (case, repeat) == (3, 1) else Verdict.VERIFIED,
+               status=Verdict.WRONG if (case, repeat) == (3, 1) else Verdict.VERIFIED,
                claimed="failed" if (case, repeat) == (5, 2) else "solved")
         for case in range(6)
         for repeat in range(3)
@@ -194,14 +193,14 @@ def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidenc
 
 
 def test_null_arms_are_not_compared(record, evidence):
-    null = [record("a (A/A)", case, 1e-4, role="null") for case in range(6)]
+    null = [record("a (A/A)", case, 1e-4, arm="null") for case in range(6)]
     (found,) = comparison_groups(evidence([*some_records(record, 2), *null]))
     assert found.solvers == ("s00", "s01")
 
 
 def test_a_solver_that_declines_all_cases_is_not_compared(record, evidence):
     def declined(solver, case):
-        return record(solver, case, None, verdict=Verdict.DECLINED, claimed=None)
+        return record(solver, case, None, status=Verdict.DECLINED, claimed=None)
 
     records = some_records(record, 2)
     records += [declined("never", case) for case in range(6)]
@@ -230,7 +229,7 @@ def test_cases_with_missing_measurements_are_left_out(record, evidence):
 def test_the_fastest_verified_answer_of_a_sweep_is_used(record, evidence):
     records = [
         record(s, case, seconds * (2 if s == "b" else 1), tol=tol, accuracy=1e-6,
-               verdict=status)
+               status=status)
         for s in "ab"
         for case in range(6)
         for tol, seconds, status in (
@@ -246,12 +245,10 @@ def test_the_fastest_verified_answer_of_a_sweep_is_used(record, evidence):
 
 def test_a_time_limit_is_censored_and_a_refuted_answer_is_not(record, evidence):
     ends = {
-        0: dict(seconds=None, verdict=Verdict.TIME_LIMIT, claimed=None),
-        1: dict(seconds=7.0, verdict=Verdict.TIME_LIMIT, claimed="time_limit"),
-        2: dict(seconds=0.1, verdict=Verdict.WRONG),
-        3: dict(
-            seconds=0.1, verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit"
-        ),
+        0: dict(seconds=None, status=Verdict.TIME_LIMIT, claimed=None),
+        1: dict(seconds=7.0, status=Verdict.TIME_LIMIT, claimed="time_limit"),
+        2: dict(seconds=0.1, status=Verdict.WRONG),
+        3: dict(seconds=0.1, status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
     }
     records = some_records(record, 1)
     records += [record("b", case, **ends.get(case, {})) for case in range(6)]
@@ -265,7 +262,7 @@ def test_a_time_limit_is_censored_and_a_refuted_answer_is_not(record, evidence):
 
 
 def test_one_time_limit_makes_a_cell_late(record, evidence):
-    late = dict(verdict=Verdict.TIME_LIMIT, claimed=None, seconds=None)
+    late = dict(status=Verdict.TIME_LIMIT, claimed=None, seconds=None)
     records = some_records(record, 2)
     records += [record("z", case, repeat=i) for case in range(6) for i in range(2)]
     records += [record("z", 2, repeat=2, **late)]
@@ -289,7 +286,7 @@ def test_a_planted_ratio_is_in_the_table_of_means(record, evidence):
 def test_a_ratio_needs_enough_cases_that_both_solved(record, evidence):
     some = [
         record(
-            "some", case, 1.0, verdict=Verdict.WRONG if case > 4 else Verdict.VERIFIED
+            "some", case, 1.0, status=Verdict.WRONG if case > 4 else Verdict.VERIFIED
         )
         for case in range(8)
     ]
@@ -300,7 +297,7 @@ def test_a_ratio_needs_enough_cases_that_both_solved(record, evidence):
 
 
 def test_a_solver_that_solves_nothing_has_no_mean(record, evidence):
-    bad = [record("bad", case, verdict=Verdict.WRONG) for case in range(6)]
+    bad = [record("bad", case, status=Verdict.WRONG) for case in range(6)]
     page = compose(evidence([*some_records(record, 2), *bad]))
     cells = rows(section(page, "means").tables[0])["bad"]
     assert cells["mean"].text == cells["mean up to the limit"].text == "none solved"
@@ -311,7 +308,7 @@ def test_a_solver_that_solves_nothing_has_no_mean(record, evidence):
 def test_the_rank_of_a_solver_with_false_claims_depends_on_the_convention(
     record, evidence
 ):
-    liar = [record("liar", case, 1e-4, verdict=Verdict.WRONG) for case in range(6)]
+    liar = [record("liar", case, 1e-4, status=Verdict.WRONG) for case in range(6)]
     found = section(compose(evidence([*some_records(record, 2), *liar])), "ranking")
     cells = rows(found.tables[0])
     assert cells["liar"]["rank"].value == 3
@@ -446,7 +443,7 @@ def test_ratios_whose_interval_contains_one_are_ties(record, evidence):
     noise = [1.1, 0.9, 1.05, 0.97]
     records = [record("a", 0, 0.01, i) for i in range(4)]
     records += [record("b", 0, 0.0101 * e, i) for i, e in enumerate(noise)]
-    records += [record("c", 0, 0.001, i, verdict=Verdict.WRONG) for i in range(4)]
+    records += [record("c", 0, 0.001, i, status=Verdict.WRONG) for i in range(4)]
     (row,) = section(compose(evidence(records)), "ratios").tables[0].rows
     assert [cell.kind for cell in row[2:]] == ["best", "tied", ""]
     assert row[-1].value is None
@@ -536,10 +533,10 @@ def test_without_counts_there_is_no_section_on_steps(record, evidence):
 def test_claims_and_verdicts_are_counted_in_one_table(record, evidence):
     ends = [
         dict(),
-        dict(verdict=Verdict.WRONG),
-        dict(verdict=Verdict.VERIFIED, claimed="failed"),
-        dict(verdict=Verdict.TIME_LIMIT, claimed=None),
-        dict(verdict=Verdict.DECLINED, claimed=None),
+        dict(status=Verdict.WRONG),
+        dict(status=Verdict.VERIFIED, claimed="failed"),
+        dict(status=Verdict.TIME_LIMIT, claimed=None),
+        dict(status=Verdict.DECLINED, claimed=None),
     ]
     records = [record("a", case, **end) for case, end in enumerate(ends)]
     (table,) = section(compose(evidence(records)), "tally").tables
@@ -550,7 +547,7 @@ def test_claims_and_verdicts_are_counted_in_one_table(record, evidence):
 
 def test_one_refuted_repeat_refutes_the_claim(record, evidence):
     records = [record("a", 0, repeat=i) for i in range(3)]
-    records[1] = records[1].replace(verdict=Verdict.INACCURATE)
+    records[1] = records[1].replace(status=Verdict.INACCURATE)
     (table,) = section(compose(evidence(records)), "tally").tables
     assert [c.value for c in rows(table)["a"].values()][1:] == [0, 1, 0, 0, 0.0]
 
@@ -606,7 +603,7 @@ def test_a_lone_surrogate_in_a_name_is_accepted(record, evidence):
 
 def test_the_table_contests_contains_the_ratios_of_profiles(record, evidence):
     records = some_records(record, 2)
-    records[0] = records[0].replace(verdict=Verdict.WRONG)
+    records[0] = records[0].replace(status=Verdict.WRONG)
     sheet = csv_tables(evidence(records))["contests"]
     by_cell = sheet.set_index(["case", "solver"])
     assert set(by_cell["ratio"]) == {1.0, 2.0, np.inf}
@@ -656,7 +653,7 @@ def test_sessions_are_ranked_by_unpaired_intervals_on_every_case(evidence, recor
         ]  # fmt: skip
         assert faster[0, 2] == told
         assert not faster[2, 0]
-    together = [replace(r, session="") for r in of_two_sessions(record, 1.0015)]
+    together = [r.replace(session="") for r in of_two_sessions(record, 1.0015)]
     (group,) = comparison_groups(evidence(together))
     assert group.apart.size == 0
 

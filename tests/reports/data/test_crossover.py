@@ -49,7 +49,7 @@ def measured(repeats=3):
             if n == SIZES[0]:
                 yield one("a", n, 1.0, 1.0, feti=4)
                 yield one("a ranks=2", n, 1.0, 1.0, feti=4, ranks=2)
-    stop = dict(verdict=Verdict.MEMORY_LIMIT, quantities={}, total_seconds=None)
+    stop = dict(status=Verdict.MEMORY_LIMIT, quantities={}, total_seconds=None)
     yield record("a", SIZES[1], None, None, feti=4, **stop)
 
 
@@ -122,7 +122,7 @@ def test_the_section_names_every_route_even_those_without_measurements(evidence)
 
 
 def test_a_route_that_all_solvers_declined_differs_from_one_not_measured(evidence):
-    declined = dict(verdict=Verdict.DECLINED, quantities={}, total_seconds=None)
+    declined = dict(status=Verdict.DECLINED, quantities={}, total_seconds=None)
     records = [
         *measured(),
         *(record("a", n, None, None, form="dual-bounds", **declined) for n in SIZES),

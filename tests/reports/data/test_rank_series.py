@@ -90,7 +90,7 @@ def test_cases_of_other_sizes_are_not_weak_scaling():
 
 def test_answers_that_were_not_verified_are_left_out():
     wrong = (
-        r.replace(verdict=Verdict.WRONG) if r.ranks == 2 and not r.role else r
+        r.replace(status=Verdict.WRONG) if r.ranks == 2 and not r.arm else r
         for r in rank_records(sizes=[DOFS])
     )
     (series,) = strong_series(evidence(wrong))
@@ -120,7 +120,7 @@ def test_weak_scaling_alone_explains_grey_numbers():
     records = [
         r
         for r in rank_records(sizes=[DOFS // 4, DOFS], ranks=[1, 4])
-        if not r.role and (r.ranks == 4) is r.case.endswith("S=100/dual")
+        if not r.arm and (r.ranks == 4) is r.case.endswith("S=100/dual")
     ]
     alone = evidence(records, cpus=2)
     assert weak_series(alone)

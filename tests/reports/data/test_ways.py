@@ -206,7 +206,7 @@ def test_single_repeats_of_few_problems_name_no_winner(record, evidence):
 
 def test_a_form_that_no_solver_solves_completely_is_named(record, evidence):
     records = [
-        r.replace(verdict=Verdict.WRONG)
+        r.replace(status=Verdict.WRONG)
         if r.form == "primal" and r.params["n"] == 3
         else r
         for r in four_ways(record)

@@ -76,7 +76,7 @@ def swept():
         r.replace(
             run_id=f"{solver} {tol}", tol=tol, accuracy=1e-3, energy_bound=2 * tol,
             primal=2 * tol, dual=0.0, complementarity=0.0, gap=0.0,
-            verdict=Verdict.VERIFIED, claimed="solved",
+            status=Verdict.VERIFIED, claimed="solved",
         )
         for solver, r in first.items()
         for tol in TOLS
@@ -109,7 +109,7 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
         r.replace(run_id=f"{solver} {n} {i}", solver=solver, case=f"box/n={n}/dual",
               family="box", form="dual", params={"n": n}, iterations=n,
               sizes={"variables": n}, quantities={"dofs": n}, total_seconds=1e-6 * n,
-              verdict=Verdict.VERIFIED)
+              status=Verdict.VERIFIED)
         for solver in ("a", "b")
         for n, r in zip((10, 20, 40, 80), records(1, 4, 1), strict=True)
         for i in range(3)
@@ -141,7 +141,7 @@ def test_guide_lines_do_not_squeeze_nearly_equal_times(spread):
         r.replace(run_id=f"{n}", solver="a", case=f"box/n={n}/dual", family="box",
               form="dual", params={"n": n}, sizes={"variables": n},
               quantities={"dofs": n}, total_seconds=1e-3 * spread**i,
-              verdict=Verdict.VERIFIED)
+              status=Verdict.VERIFIED)
         for i, n, r in zip((0, 0.5, 1), (100, 1000, 10000), records(1, 3, 1),
                            strict=True)
     ]  # fmt: skip

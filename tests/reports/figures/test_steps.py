@@ -21,7 +21,7 @@ def records(**but):
         yield Record(
             run_id=f"{n:012d}", case=f"plate/Sx={n}/dual", family="plate",
             params={"Sx": n}, form="dual", solver="smalbe", options={}, tol=1e-6,
-            repeat=0, block=0, verdict=Verdict.VERIFIED, claimed="solved",
+            repeat=0, block=0, status=Verdict.VERIFIED, claimed="solved",
             iterations=20, total_seconds=1e-6 * n, sizes={},
             counts={"P_products": 30, "cg": round((n / 1000) ** 0.25 * 7),
                     "expansion": 2, "proportioning": 0},

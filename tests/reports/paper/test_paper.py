@@ -125,7 +125,7 @@ def record(solver, form, m, seconds, repeat, **changes):
         run_id=f"{solver} {form} {m} {repeat} {changes.get('tol')}",
         case=f"beam-ring/m={m}/{form}", family="beam-ring", params={"m": m}, form=form,
         sizes={"variables": SIZES[m] if form == "primal" else m}, solver=solver,
-        options={}, tol=1e-6, repeat=repeat, block=repeat, verdict=Verdict.VERIFIED,
+        options={}, tol=1e-6, repeat=repeat, block=repeat, status=Verdict.VERIFIED,
         claimed="solved", total_seconds=seconds, primal=1e-9, dual=1e-9,
         complementarity=1e-9, gap=1e-9, quantities={"dofs": SIZES[m]},
         dualise_seconds=None if form == "primal" else 0.5,
@@ -142,7 +142,7 @@ def synthetic():
     fleet = [
         record(solver, form, m, 1e-6 * m**2 * (1 + repeat / 100), repeat,
                **(wrong if solver == "lazy" and m == 200 else {}))
-        for wrong in [dict(verdict=Verdict.WRONG, total_seconds=1e-9, quantities={})]
+        for wrong in [dict(status=Verdict.WRONG, total_seconds=1e-9, quantities={})]
         for solver in ("smalbe", "lazy") for form in ("primal", "dual", "dual-bounds")
         for m in SIZES for repeat in range(3)
     ]  # fmt: skip

@@ -130,7 +130,7 @@ def test_a_winner_needs_both_the_interval_and_the_signs(record, opened, logs, wh
 def test_few_solved_cases_have_no_ratio_over_cases(record, opened):
     """This occurs, for example, if more steps are requested than a sequence has."""
     records = [
-        record(s, k, 0.01, **({} if k < 4 else {"verdict": Verdict.DECLINED}))
+        record(s, k, 0.01, **({} if k < 4 else {"status": Verdict.DECLINED}))
         for k in range(9) for s in "ab"
     ]  # fmt: skip
     (claim,) = opened(records)["dual"].claims
@@ -155,7 +155,7 @@ def test_a_winner_among_equal_solvers_is_rarely_named(record, evidence, cases):
 
 @pytest.mark.parametrize("make", [one_case, many_cases])
 def test_a_fast_solver_with_refuted_claims_does_not_win(record, opened, make):
-    lies = dict(verdict=Verdict.WRONG, claimed="solved", dual=0.03)
+    lies = dict(status=Verdict.WRONG, claimed="solved", dual=0.03)
     liar = [r.replace(**lies) for r in make(record, liar=0.01)]
     statement = opened(make(record, honest=1.0, slow=2.0) + liar)["dual"]
     (claim,) = statement.claims
@@ -169,7 +169,7 @@ def test_a_fast_solver_with_refuted_claims_does_not_win(record, opened, make):
 
 def test_one_refuted_repeat_excludes_a_solver(record, opened):
     records = one_case(record, fast=0.1, honest=1.0, slow=2.0)
-    records[3] = records[3].replace(verdict=Verdict.INACCURATE, dual=1e-3)
+    records[3] = records[3].replace(status=Verdict.INACCURATE, dual=1e-3)
     statement = opened(records)["dual"]
     assert statement.claims[0].startswith("honest was the fastest")
     assert (
@@ -179,7 +179,7 @@ def test_one_refuted_repeat_excludes_a_solver(record, opened):
 
 def test_a_solver_that_fails_on_half_of_the_cases_is_not_the_fastest(record, opened):
     half = [
-        r.replace(verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit")
+        r.replace(status=Verdict.ITERATION_LIMIT, claimed="iteration_limit")
         if r.params["n"] % 2 else r
         for r in many_cases(record, half=1e-4)
     ]  # fmt: skip
@@ -190,7 +190,7 @@ def test_a_solver_that_fails_on_half_of_the_cases_is_not_the_fastest(record, ope
 
 def test_faster_solvers_that_are_not_always_verified_are_named(record, opened):
     almost = many_cases(record, almost=0.5)
-    almost[0] = almost[0].replace(verdict=Verdict.CRASHED)
+    almost[0] = almost[0].replace(status=Verdict.CRASHED)
     statement = opened(many_cases(record, sure=1.0, slow=2.0) + almost)["dual"]
     assert statement.claims[0].startswith("sure was the fastest over 8 cases")
     faster = statement.remarks[0]
@@ -205,9 +205,9 @@ def test_faster_solvers_that_are_not_always_verified_are_named(record, opened):
 
 def test_no_winner_is_named_if_every_solver_failed_on_some_case(record, opened):
     a, b = many_cases(record, a=1.0), many_cases(record, b=2.0)
-    a[0] = a[0].replace(verdict=Verdict.TIME_LIMIT)
-    b[5] = b[5].replace(verdict=Verdict.CRASHED, message="signal 11")
-    b[6] = b[6].replace(verdict=Verdict.CRASHED, message="signal 11")
+    a[0] = a[0].replace(status=Verdict.TIME_LIMIT)
+    b[5] = b[5].replace(status=Verdict.CRASHED, message="signal 11")
+    b[6] = b[6].replace(status=Verdict.CRASHED, message="signal 11")
     statement = opened(a + b)["dual"]
     assert statement.claims == (
         "No solver is named the fastest over 8 cases at tol 1e-6: no solver was "
@@ -219,7 +219,7 @@ def test_no_winner_is_named_if_every_solver_failed_on_some_case(record, opened):
 
 def test_a_case_that_no_solver_solved_is_counted_separately(record, opened):
     records = [
-        r.replace(verdict=Verdict.TIME_LIMIT) if r.params["n"] == 7 else r
+        r.replace(status=Verdict.TIME_LIMIT) if r.params["n"] == 7 else r
         for r in many_cases(record, fast=1.0, slow=3.0)
     ]
     statement = opened(records)["dual"]
@@ -234,7 +234,7 @@ def test_a_single_solver_is_not_compared(record, opened):
 
 
 def test_the_only_verified_solver_is_not_named_the_fastest(record, opened):
-    failed = [r.replace(verdict=Verdict.FAILED, message="gave up")
+    failed = [r.replace(status=Verdict.FAILED, message="gave up")
               for r in one_case(record, other=0.5)]  # fmt: skip
     (claim,) = opened(one_case(record, lonely=1.0) + failed)["dual"].claims
     assert "No solver is named the fastest" in claim
@@ -272,7 +272,7 @@ def test_the_only_solver_that_reuses_no_answers_is_not_the_fastest(record, opene
 
 def test_a_form_without_verified_answers_is_reported(record, opened):
     records = [
-        r.replace(verdict=Verdict.ITERATION_LIMIT)
+        r.replace(status=Verdict.ITERATION_LIMIT)
         for r in one_case(record, a=1.0, b=2.0)
     ]
     assert opened(records)["dual"].claims == ("No answer was verified at tol 1e-6.",)
@@ -359,9 +359,9 @@ def test_only_a_few_of_many_tolerances_are_described(record, opened):
 
 def test_a_null_arm_does_not_compete(record, opened):
     records = one_case(record, a=1.0, b=2.0)
-    null = [r.replace(solver="a (null)", role="null", run_id=f"{r.run_id}-null")
+    null = [r.replace(solver="a (null)", arm="null", run_id=f"{r.run_id}-null")
             for r in one_case(record, seed=2, a=1.0)]  # fmt: skip
-    null[0] = null[0].replace(verdict=Verdict.CRASHED)
+    null[0] = null[0].replace(status=Verdict.CRASHED)
     statement = opened(records + null)["dual"]
     assert statement.claims[0].startswith("a was the fastest")
     assert not any("null" in line for line in statement.lines)
@@ -381,10 +381,10 @@ def test_sequences_are_compared_with_sequences(record, opened):
 
 
 def test_the_fastest_verified_answers_of_sweeps_are_compared(record, opened):
-    def swept(solver, tol, seconds, verdict=Verdict.VERIFIED):
+    def swept(solver, tol, seconds, status=Verdict.VERIFIED):
         return [
             record(solver, 0, seconds * (1 + i / 100), i, tol=tol, accuracy=1e-6,
-                   verdict=verdict)
+                   status=status)
             for i in range(4)
         ]  # fmt: skip
 
@@ -415,7 +415,7 @@ def test_times_at_equal_certified_error_are_compared(record, opened):
 
 def test_declined_cases_are_reported_separately_from_failures(record, opened):
     shy = record(
-        "shy", 0, None, verdict=Verdict.DECLINED, claimed="", message="too large"
+        "shy", 0, None, status=Verdict.DECLINED, claimed="", message="too large"
     )
     statement = opened([*one_case(record, a=1.0, b=2.0), shy])["dual"]
     assert "Declined: shy (too large)." in statement.remarks
@@ -424,7 +424,7 @@ def test_declined_cases_are_reported_separately_from_failures(record, opened):
 
 def test_many_failures_are_counted_not_listed(record, opened):
     lost = [
-        r.replace(verdict=Verdict.FAILED, message="no")
+        r.replace(status=Verdict.FAILED, message="no")
         for k in range(30) for r in one_case(record, blocks=2, **{f"s{k:02d}": 1.0})
     ]  # fmt: skip
     statement = opened([*one_case(record, a=1.0, b=2.0), *lost])["dual"]
@@ -482,7 +482,7 @@ def test_names_cannot_break_out_of_the_answer(record, evidence):
     names = ("<b>x</b>", r"\input{a}$", "| a |\n## b", "\u202eleft", "", "n" * 5000)
     records = [
         record(name, 0, 0.01 * (k + 1) * (1 + i / 100), i, form=form,
-               verdict=Verdict.WRONG if k == 2 else Verdict.VERIFIED, message=name,
+               status=Verdict.WRONG if k == 2 else Verdict.VERIFIED, message=name,
                run_id=f"{k}-{i}-{n}")
         for n, form in enumerate((*names, "dual"))
         for k, name in enumerate(names) for i in range(3)
@@ -522,7 +522,7 @@ def test_every_point_of_the_figure_shows_its_measurements(record, evidence):
 
 
 def test_unverified_answers_are_at_the_edge_with_their_verdict(record, evidence):
-    lost = [r.replace(verdict=Verdict.TIME_LIMIT) for r in one_case(record, lost=0.1)]
+    lost = [r.replace(status=Verdict.TIME_LIMIT) for r in one_case(record, lost=0.1)]
     made = evidence(one_case(record, a=1.0, b=2.0) + lost)
     (panel,) = fastest_figure(found(made), made.solvers).panels
     assert panel.y.ticks == ((0.0, "a"), (-1.0, "b"), (-2.0, "lost"))
@@ -534,7 +534,7 @@ def test_unverified_answers_are_at_the_edge_with_their_verdict(record, evidence)
 
 def test_without_answers_there_is_no_figure(record, evidence):
     lost = [
-        r.replace(verdict=Verdict.TIME_LIMIT) for r in one_case(record, a=1.0, b=1.0)
+        r.replace(status=Verdict.TIME_LIMIT) for r in one_case(record, a=1.0, b=1.0)
     ]
     made = evidence(lost)
     assert fastest_figure(found(made), made.solvers) is None

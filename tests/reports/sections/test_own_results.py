@@ -78,7 +78,7 @@ def test_condition_numbers_have_separate_ranges(record, page):
 
 def test_failures_of_the_only_solver_are_reported(record, page):
     records = sized(record, [9, 9, 9, 9, 9])
-    records[2] = records[2].replace(verdict=Verdict.WRONG, dual=0.03)
+    records[2] = records[2].replace(status=Verdict.WRONG, dual=0.03)
     own, dual = page(records).sections[0].statements
     assert own.subject == "a"
     assert "a claimed success but was wrong on 1 of 5 cases" in dual.remarks[0]

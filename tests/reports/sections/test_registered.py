@@ -17,7 +17,7 @@ def analysis(monkeypatch, tmp_path):
         Record(
             run_id=solver, case="box/n=1/dual", family="box", params={"n": 1},
             form="dual", sizes={"variables": 1}, solver=solver, options={}, tol=1e-8,
-            repeat=0, block=0, verdict=Verdict.VERIFIED, claimed="solved",
+            repeat=0, block=0, status=Verdict.VERIFIED, claimed="solved",
             total_seconds=0.003, primal=0.0, dual=0.0, complementarity=0.0, gap=0.0,
             environment="e", started="2026-11-21T10:00:00+00:00",
         )
