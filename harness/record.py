@@ -284,7 +284,8 @@ class Record(Struct, frozen=True, kw_only=True):
             what, _, place = str(e).partition(" - at `$.")
             if place == "status`":
                 what += f"; expected one of {', '.join(Verdict)}"
-            raise ValueError(f"{place.strip('`')}: {shortened(what)}") from None
+            place = place.strip("`") or "journal line"
+            raise ValueError(f"{place}: {shortened(what)}") from None
         except (DecodeError, RecursionError, UnicodeDecodeError) as e:
             raise ValueError(f"damaged ({e}); expected a JSON object") from None
         if shared is not None:

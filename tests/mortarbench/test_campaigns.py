@@ -263,7 +263,7 @@ def test_a_measurement_of_two_sessions_is_replayed_by_session_and_run_id(
         ),
         (
             lambda a, b: (b / "journal/x.jsonl").write_text("{}\n"),
-            "journal line of sch",
+            "journal line: Object missing required field",
         ),
         (
             lambda a, b: (b / "suite.toml").write_text('name = "b"\ntime_limit = 5\n'),
