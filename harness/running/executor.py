@@ -161,9 +161,7 @@ class Executor:
         if block.is_sequence and source.is_shared:
             self._worker(turn[0].solver).close()  # ranks remain between steps only
         for record in turn[len(available) :]:
-            declined = record.replace(
-                status=Verdict.DECLINED, message=self._end_reason
-            )
+            declined = record.replace(status=Verdict.DECLINED, message=self._end_reason)
             yield Result(record=declined)
 
     def _request(
