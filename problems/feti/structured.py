@@ -328,23 +328,6 @@ class Layout:
             for m, count in in_row.items()
         }
 
-    def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """Return pairs of blocks and the number of nodes they share, all (k,).
-
-        Blocks that share only a corner are omitted.
-        """
-        body, column, row = self.block
-        all_ = np.arange(self.count)
-        _, _, columns, rows = self.corner(all_)
-        deep = np.array([y.size - 1 for _, y in self.cuts])
-        right, up = column + 1 < self._blocks_per_row[body], row + 1 < deep[body]
-        above = all_ + self._blocks_per_row[body]
-        return (
-            np.concatenate([all_[right], all_[up]]),
-            np.concatenate([all_[right] + 1, above[up]]),
-            np.concatenate([rows[right], columns[up]]),
-        )
-
     def glued(self) -> NDArray[np.int64]:
         """Return, for each block (S,), the number of its nodes on interfaces."""
         left, low, columns, rows = self.corner(np.arange(self.count))

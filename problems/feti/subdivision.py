@@ -16,7 +16,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, triu
 
 from mortarbench.harness.digest import hex_digest
 from mortarbench.problems.fem.mesh import HalfDisc, Mesh, Nodes
@@ -97,12 +96,6 @@ class Subdivision(Protocol):
     @property
     def nodes_by_multiplicity(self) -> Mapping[int, int]:
         """Number of nodes with m copies, for each m > 1."""
-
-    def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """Return pairs of subdomains and the number of nodes they share, all (k,).
-
-        Pairs that share only a corner may be omitted.
-        """
 
     def glued(self) -> NDArray[np.int64]:
         """Return, for each subdomain (S,), the number of its nodes on interfaces."""
@@ -211,14 +204,6 @@ class ListedSubdivision:
         return {
             int(m): int(n) for m, n in zip(multiplicity, count, strict=True) if m > 1
         }
-
-    def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """Return pairs of subdomains and the number of nodes they share, all (k,)."""
-        shape = (self.node.size, self.count)
-        ones = np.ones(self.holders.size, dtype=np.int64)
-        has = csr_array((ones, self.holders, self.start), shape=shape)
-        pairs = coo_array(triu(has.T @ has, k=1))
-        return pairs.row, pairs.col, pairs.data
 
     def glued(self) -> NDArray[np.int64]:
         """Return, for each subdomain (S,), the number of its nodes on interfaces."""

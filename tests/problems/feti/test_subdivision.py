@@ -155,15 +155,9 @@ def test_sides_of_bodies_and_interfaces_have_subdomains_and_points(known):
         assert_array_equal(of.holder(chain), by_node[first])
 
 
-def test_neighbours_are_those_with_common_nodes(known):
+def test_glued_nodes_are_those_of_other_subdomains(known):
     of, _, _, whole = known
     own = [set(part) for part in np.split(whole.node, whole.start[1:-1])]
-    common = {(t, s): len(own[s] & own[t]) for s in range(len(own)) for t in range(s)}
-    one, other, nodes = of.shared_node_counts()
-
-    found = dict(zip(zip(one, other, strict=True), nodes, strict=True))
-    assert found == {pair: n for pair, n in common.items() if pair in found}
-    assert {pair for pair, n in common.items() if n > 2} <= set(found)
     glued = [sum(n in neighbour for n in mine) for mine, neighbour in _around(own)]
     assert of.glued().tolist() == glued
 
