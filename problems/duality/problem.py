@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, wraps
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,15 +43,9 @@ from mortarbench.problems.fem.mesh import (
     StructuredGrid,
     join,
 )
-from mortarbench.problems.feti.partition import graph_partition
-from mortarbench.problems.feti.structured import grids_in_blocks
-from mortarbench.problems.feti.subdivision import Subdivision
-from mortarbench.problems.feti.tearing import (
-    compact_blocks,
-    compact_boxes,
-    joined_labels,
-    label_blocks,
-)
+
+if TYPE_CHECKING:
+    from mortarbench.problems.feti.subdivision import Subdivision
 
 #: function that linearises contact at a displacement (n,) in m
 Linearise: TypeAlias = Callable[[Vector], ContactRows]
@@ -91,6 +85,9 @@ class Shape(ABC):
 
     def _labelled(self, labels: Sequence[NDArray[np.int64]]) -> Subdivision:
         """Return the subdivision with the labels (E,) of the cells of each body."""
+        from mortarbench.problems.feti.subdivision import Subdivision
+        from mortarbench.problems.feti.tearing import joined_labels
+
         return Subdivision(self.mesh, joined_labels(labels), self.body)
 
 
@@ -107,6 +104,8 @@ class StructuredGrids(Shape):
 
     def layout(self, size: int) -> Subdivision:
         """Cut each grid into blocks of at most `size` cells per side."""
+        from mortarbench.problems.feti.structured import grids_in_blocks
+
         return grids_in_blocks(self.parts, size, self.joined)
 
 
@@ -127,6 +126,8 @@ class HalfDiscs(Shape):
         The cuts keep the aspect ratios of blocks near 1. The triangles at the centre
         count as the last ring of cells.
         """
+        from mortarbench.problems.feti.tearing import compact_blocks, label_blocks
+
         blocks = (compact_blocks(disc.lengths(), size) for disc in self.parts)
         return self._labelled([label_blocks(cut) for cut in blocks])
 
@@ -148,6 +149,8 @@ class StructuredSolids(Shape):
 
     def layout(self, size: int) -> Subdivision:
         """Cut each box into compact blocks of at most `size` cells per side."""
+        from mortarbench.problems.feti.tearing import compact_boxes
+
         grids = zip(self.parts, self.divisions, strict=True)
         return self._labelled(
             [
@@ -170,9 +173,10 @@ class Meshed(Shape):
 
     def layout(self, size: int) -> Subdivision:
         """Cut the bodies into `size` subdomains by graph partitioning."""
+        from mortarbench.problems.feti.partition import graph_partition
+
         mesh, body = self.joined
-        label = graph_partition(mesh.points, mesh.cells, body, size)
-        return Subdivision(mesh, label, body)
+        return self._labelled([graph_partition(mesh.points, mesh.cells, body, size)])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
