@@ -17,8 +17,9 @@ from sksparse.cholmod import cholesky
 
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.stepping import forces_of, load_steps
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.monolithic import load_path
+from mortarbench.problems.duality.monolithic import load_path, recovered
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -60,10 +61,11 @@ def analysis(form, Nr=30, Nh=15, steps=10):
         assert s.status == "solved"
         return s
 
+    stages = load_steps(steps, 1, forces_of(bodies.f), bodies.B_D.indices)
     path = load_path(
-        bodies, linearise, lambda: inverse, solve, steps, transform=transform
+        bodies, stages, lambda _: linearise, lambda _: inverse, solve, transform
     )
-    u = path.solution(steps) * bodies.length
+    u = recovered(path.problem(steps)).x * bodies.length
     lap("recovery")
     return bodies, u, spent
 

@@ -11,7 +11,7 @@ from typing import Any
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
 
-EXPORTS = (".npz", ".mat", ".parquet", ".qps", ".hdf5")  #: suffixes of exported QPs
+EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: suffixes of exported QPs
 ARCHIVES = (".npz",)  #: suffix of a written answer
 PICTURES = (".png", ".pdf", ".svg")  #: suffixes of pictures
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: formats of a report

@@ -167,12 +167,6 @@ class Case(plugin.Case):
                 from mortarbench.problems.files.qps import save_qps
 
                 save_qps(path, self.qp, meta)
-            case ".hdf5":
-                from mortarbench.problems.files.fclib import save_fclib
-
-                is_stored = self.id.family.name == "fclib"
-                source = str(self.params["path"]) if is_stored else ""
-                save_fclib(path, self.qp, meta, source)
             case _:
                 from mortarbench.harness.files.qpfile import save_qp
 
@@ -255,11 +249,7 @@ def as_case(problem: Case | QP | str | object, plugins: Plugins = ()) -> Case:
 def export(
     case: Case | QP | str | object, path: str | Path, *, plugins: Plugins = ()
 ) -> Path:
-    """Write a QP for other programs: .npz, .mat, .parquet, .qps, or .hdf5 (FCLIB).
-
-    FCLIB files contain problems over friction cones (`Cones`). For a case
-    ``fclib:PATH``, the file contains the problem of the original file with all arrays
-    unchanged, not the convex problem of the case.
+    """Write a QP for other programs: .npz, .mat, .parquet or .qps.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
@@ -37,11 +37,10 @@ from mortarbench.problems.duality.monolithic import monolithic_path
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
-    DisplacedMesh,
     InterfaceState,
 )
 from mortarbench.problems.fem.inverse import GeneralisedInverse
-from mortarbench.problems.fem.mesh import Mesh, Nodes
+from mortarbench.problems.fem.mesh import Nodes
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -69,7 +68,7 @@ def case_of(
 
     def results(s: Solution) -> Mapping[str, Any]:
         state = InterfaceState(bodies, primal, s, whole.rows, friction)
-        solution = MonolithicSolution(state, bodies, count)
+        solution = MonolithicSolution(state, count)
         values = quantities(bodies, primal, s, whole.rows, friction)
         return {**values, **problem.results(solution)}
 
@@ -110,19 +109,11 @@ class MonolithicSolution:
     """Solution for undivided bodies; see `ContactSolution`."""
 
     sides: InterfaceState
-    bodies: Bodies
     problems: int
 
     def at(self, component: Nodes) -> Vector:
         """Return the nondimensional displacement at components (k,)."""
         return self.sides.solution.x[component]
-
-    def meshes(self) -> Iterator[DisplacedMesh]:
-        """Yield the displaced mesh of each body."""
-        bodies, u = self.bodies, self.sides.solution.x * self.bodies.length
-        for b in range(len(bodies.names)):
-            mesh = Mesh(bodies.mesh.points, bodies.mesh.cells[bodies.body == b], {})
-            yield DisplacedMesh(b, mesh, bodies.body_of_node == b, u)
 
 
 def contact_case(

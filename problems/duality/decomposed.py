@@ -6,10 +6,10 @@ on the contact sides; no undivided stiffness matrix is assembled.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,6 @@ from mortarbench.problems.duality.feti_dual import (
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
-    DisplacedMesh,
     ElasticBodies,
     InterfaceState,
 )
@@ -62,12 +61,12 @@ from mortarbench.problems.fem.fixing import fixing_nodes
 from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
+    as_vectors,
     dofs_of,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
-from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
@@ -250,7 +249,7 @@ def decompose(
         E=E,
         names=bodies.names if pieces is None else joined_names(bodies.names, pieces),
         piece=pieces,
-        shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
+        shaping=None if layout.shaping is None else layout.shaping(share),
         fixed=stage.fixed,
         load=force_lookup(load),
         lift=lift,
@@ -346,7 +345,7 @@ def linearise_sides(
     elastic = problem.bodies
     node = side_nodes(elastic.pairs)
     bodies = ContactSides(
-        mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
+        mesh=Mesh(layout.mesh.points[node], np.zeros((0, 4), dtype=np.int64), {}),
         body_of_node=np.asarray(layout.body[layout.holder(node)]),
         names=elastic.names,
         pairs=tuple(pair.renumbered(node) for pair in elastic.pairs),
@@ -382,12 +381,6 @@ class TornSolution:
     def at(self, component: Nodes) -> Vector:
         """Return the nondimensional displacement at global components (k,)."""
         return self.u[component]
-
-    def meshes(self) -> Iterator[DisplacedMesh]:
-        """Yield the displaced subdomains."""
-        torn = self.dual.torn
-        every = np.arange(torn.problem.layout.count)
-        return displaced_meshes(torn, every, self.u * self.elastic.length)
 
     @property
     def energy(self) -> float:
@@ -468,98 +461,8 @@ def elastic_class(
     )
 
 
-#: number of nodes per batch of subdomains; limits the memory for stresses
-BATCH_NODES = 2**15
 #: number of layers of cells around a node on which its recovered stress may depend
 STRESS_LAYERS = 3
-
-
-def displaced_meshes(
-    torn: TornBodies, subdomains: Nodes, u: Vector, layers: int = 0
-) -> Iterator[DisplacedMesh]:
-    """Yield batches of displaced subdomains.
-
-    Parameters
-    ----------
-    subdomains : numbers of subdomains
-    u : (n,) displacement, m
-    layers : number of layers of neighbouring cells to add
-
-    """
-    layout, dim = torn.problem.layout, torn.problem.components
-    for batch in _batches(layout, subdomains):
-        part = _with_layers(layout, batch, layers)
-        mesh = Mesh(layout.position(part.node), part.cells, {})
-        body = int(layout.body[batch[0]])
-        yield DisplacedMesh(body, mesh, part.inner, u[dofs_of(part.node, dim)])
-
-
-def _batches(layout: Subdivision, subdomains: Nodes) -> list[Nodes]:
-    """Group subdomains into batches, each of one body and `BATCH_NODES` nodes at most.
-
-    A subdomain with more nodes forms a separate batch.
-    """
-    sizes = np.diff(layout.subdomain_nodes(subdomains).start)
-    first, nodes = [0], 0
-    for s, size in enumerate(sizes):
-        other = layout.body[subdomains[s]] != layout.body[subdomains[first[-1]]]
-        if s > first[-1] and (other or nodes + size > BATCH_NODES):
-            first.append(s)
-            nodes = 0
-        nodes += int(size)
-    return np.split(subdomains, first[1:])
-
-
-class _Patch(NamedTuple):
-    """Subdomains of one body with layers of neighbouring cells."""
-
-    node: Nodes  #: (N,) global numbers
-    cells: Nodes  #: (E, corners) indices into `node`
-    inner: NDArray[np.bool_]  #: (N,) True for nodes of the subdomains
-
-
-def _with_layers(layout: Subdivision, subdomains: Nodes, layers: int) -> _Patch:
-    """Return subdomains of one body with layers of neighbouring cells."""
-    inside = np.unique(layout.subdomain_nodes(subdomains).number)
-    body = int(layout.body[subdomains[0]])
-    included = subdomains
-    if layers:
-        included = np.union1d(subdomains, _holders(layout, inside, body))
-    nodes, cells = _cells_of(layout, included)
-    reached, selected = inside, np.ones(len(cells), dtype=bool)
-    for _ in range(layers):
-        neighbours = np.setdiff1d(_holders(layout, reached, body), included)
-        if neighbours.size:
-            included = np.concatenate([included, neighbours])
-            nodes, cells = _cells_of(layout, included)
-        selected = np.asarray(np.isin(nodes, reached)[cells].any(axis=1))
-        used = np.zeros(nodes.size, dtype=bool)
-        used[cells[selected]] = True
-        reached = nodes[used]
-    place = np.searchsorted(reached, nodes)
-    inner = np.isin(reached, inside, assume_unique=True)
-    return _Patch(reached, place[cells[selected]], inner)
-
-
-def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the nodes of `subdomains`, and their cells as indices into these nodes."""
-    torn = layout.subdomain_nodes(subdomains)
-    nodes, place = np.unique(torn.number, return_inverse=True)
-    cells = [
-        place[begin + layout.cells(int(s))]
-        for s, begin in zip(subdomains, torn.start, strict=False)
-    ]
-    return nodes, np.concatenate(cells)
-
-
-def _holders(layout: Subdivision, node: Nodes, body: int) -> Nodes:
-    """Return the subdomains of a body that contain interface nodes among `node`."""
-    multiplicity = layout.multiplicity(node)
-    several = multiplicity > 1
-    copies = range(int(multiplicity.max(initial=1)))
-    holders = [layout.holder(node[several & (multiplicity > c)], c) for c in copies]
-    found = np.unique(np.concatenate(holders))
-    return np.asarray(found[layout.body[found] == body])
 
 
 def largest_stresses(torn: TornBodies, elastic: ElasticBodies, u: Vector) -> Vector:
@@ -568,12 +471,22 @@ def largest_stresses(torn: TornBodies, elastic: ElasticBodies, u: Vector) -> Vec
     u : (n,) nondimensional displacement
     """
     materials, plane = elastic.materials, elastic.plane
-    D = elasticity_matrices(materials, plane)
-    largest = np.zeros(len(materials))
-    own = np.flatnonzero(torn.domains.rank == torn.comm.rank)
-    u = u * elastic.length
-    for b, mesh, inner, u_b in displaced_meshes(torn, own, u, STRESS_LAYERS):
-        stress = recover(mesh, centre_stress(mesh, D[b], u_b))[inner]
-        maximum = von_mises(stress, materials[b].nu, plane).max()
-        largest[b] = max(largest[b], maximum)
+    layout, D = torn.problem.layout, elasticity_matrices(materials, plane)
+    points, cells = layout.mesh.points, layout.mesh.cells
+    own = torn.domains.rank[layout.label] == torn.comm.rank
+    u, largest = as_vectors(u * elastic.length, layout.mesh.dim), np.zeros(len(D))
+    for b, material in enumerate(materials):
+        of_body = layout.body_of_cell == b
+        inner = np.zeros(len(points), dtype=bool)
+        inner[cells[own & of_body]] = True
+        near = inner.copy()
+        for _ in range(STRESS_LAYERS):
+            selected = of_body & near[cells].any(axis=1)
+            near[cells[selected]] = True
+        node, corner = np.unique(cells[selected], return_inverse=True)
+        if not node.size:
+            continue
+        part = Mesh(points[node], corner.reshape(-1, cells.shape[1]), {})
+        stress = recover(part, centre_stress(part, D[b], u[node].ravel()))[inner[node]]
+        largest[b] = von_mises(stress, material.nu, plane).max()
     return largest

@@ -101,24 +101,7 @@ def dualise(
     friction : law with a prescribed bound; its rows follow the contact rows
 
     """
-    f, m_E = -primal.q, primal.b.size
-    B_I, c_I = contact_rows(primal, friction)
-    B, c = csr_array(vstack([primal.A, B_I])), np.append(primal.b, c_I)
-    free = inverse(f) if free is None else free
-    structure = Structure(K=primal.P, B=B, fixed=np.zeros(0, dtype=np.int64))
-    sets = multiplier_sets(m_E, primal.h.size, friction.bound, friction.tangents)
-    qp = _dual(structure, c, inverse, f, free, sets)
-
-    def recover(s: Solution) -> Solution:
-        u = _without_motion(inverse(f - B.T @ s.x), inverse, s)  # (6)
-        return replace(s, x=u, y=s.x[:m_E], z=s.x[m_E:], z_box=np.zeros(u.size))
-
-    def interface_displacement(s: Solution) -> Vector:
-        return _without_motion(free - inverse.at_constraints(B.T @ s.x), inverse, s)
-
-    return Transformed(
-        qp, recover, -1.0, -0.5 * float(f @ free), interface_displacement
-    )
+    return _dual(primal, inverse, free, friction, with_supports=True)
 
 
 def dual_bounds(
@@ -150,25 +133,7 @@ def dual_bounds(
     friction : law with a prescribed bound; its rows follow the contact rows
 
     """
-    f, lift = -primal.q, primal.A.T @ primal.b
-    pushed = f - primal.P @ lift
-    B, c = contact_rows(primal, friction)
-    free = lift + clamped(pushed) if free is None else free
-    fixed = np.unique(csr_array(primal.A).indices).astype(np.int64)
-    structure = Structure(K=primal.P, B=B, fixed=fixed)
-    sets = multiplier_sets(0, primal.h.size, friction.bound, friction.tangents)
-    qp = _dual(structure, c, clamped, f, free, sets)
-
-    def recover(s: Solution) -> Solution:
-        u = lift + _without_motion(clamped(pushed - B.T @ s.x), clamped, s)
-        reactions = -primal.A @ (primal.P @ u - f + B.T @ s.x)
-        return replace(s, x=u, y=reactions, z=s.x, z_box=np.zeros(u.size))
-
-    def interface_displacement(s: Solution) -> Vector:
-        return _without_motion(free - clamped.at_constraints(B.T @ s.x), clamped, s)
-
-    constant = 0.5 * float(lift @ (primal.P @ free - f)) - 0.5 * float(f @ free)
-    return Transformed(qp, recover, -1.0, constant, interface_displacement)
+    return _dual(primal, clamped, free, friction, with_supports=False)
 
 
 def with_friction_bound(dual: QP, friction: Friction) -> QP:
@@ -206,26 +171,50 @@ def _without_motion(u: Vector, inverse: GeneralisedInverse, s: Solution) -> Vect
 
 
 def _dual(
-    structure: Structure,
-    c: Vector,
+    primal: QP,
     inverse: GeneralisedInverse,
-    f: Vector,
-    free: Vector,
-    sets: tuple[ConvexSet, ...],
-) -> QP:
-    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  over `sets`.
+    free: Vector | None,
+    friction: Friction,
+    *,
+    with_supports: bool,
+) -> Transformed:
+    """Return the dual with respect to the contact rows B, which support rows precede.
 
-    free : K⁺f
+    ::
+
+        min ½λᵀBK⁺Bᵀλ − (Bu_0 − c)ᵀλ,   RᵀBᵀλ = Rᵀf,   u_0 = w + K⁺(f − Kw)
+
+    with_supports : True if the support rows are rows of B, so that w = 0
     """
-    m, B, R = c.size, structure.B, inverse.kernel
+    f, B, c = -primal.q, *contact_rows(primal, friction)
+    m_E, fixed, lift = 0, np.unique(csr_array(primal.A).indices), primal.A.T @ primal.b
+    if with_supports:
+        B, c = csr_array(vstack([primal.A, B])), np.append(primal.b, c)
+        m_E, fixed, lift = primal.b.size, fixed[:0], np.zeros_like(f)
+    pushed, R = f - primal.P @ lift, inverse.kernel
+    free = lift + inverse(pushed) if free is None else free
+    structure = Structure(K=primal.P, B=B, fixed=fixed.astype(np.int64))
     moves = bool(R.shape[1])
-    return QP(
+    qp = QP(
         P=inverse.congruence(B),
         q=c - B @ free,
-        A=np.ascontiguousarray((B @ R).T) if moves else no_rows(m),
+        A=np.ascontiguousarray((B @ R).T) if moves else no_rows(c.size),
         b=R.T @ f if moves else np.zeros(0),
-        G=no_rows(m),
+        G=no_rows(c.size),
         h=np.zeros(0),
-        sets=sets,
+        sets=multiplier_sets(m_E, primal.h.size, friction.bound, friction.tangents),
         structure=structure,
     )
+
+    def recover(s: Solution) -> Solution:
+        u = lift + _without_motion(inverse(pushed - B.T @ s.x), inverse, s)  # (6)
+        y = s.x[:m_E]
+        if not with_supports:
+            y = -primal.A @ (primal.P @ u - f + B.T @ s.x)
+        return replace(s, x=u, y=y, z=s.x[m_E:], z_box=np.zeros(u.size))
+
+    def interface_displacement(s: Solution) -> Vector:
+        return _without_motion(free - inverse.at_constraints(B.T @ s.x), inverse, s)
+
+    constant = 0.5 * float(lift @ (primal.P @ free - f)) - 0.5 * float(f @ free)
+    return Transformed(qp, recover, -1.0, constant, interface_displacement)

@@ -21,17 +21,17 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
 from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.harness.mechanics import NO_FRICTION, Substructures, contact_rows
 from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.problems.duality.dualisation import Transformed, multiplier_sets
-from mortarbench.problems.feti.operators import (
+from mortarbench.problems.feti.operators import block_bytes, touched_components
+from mortarbench.problems.feti.served import (
     OperatorOnRanks,
-    block_bytes,
-    touched_components,
+    Served,
+    operator_of,
+    parts_of,
 )
-from mortarbench.problems.feti.served import Served, operator_of, parts_of
 from mortarbench.problems.feti.subdomains import TornBodies
-from mortarbench.problems.feti.substructures import LocalProblems, LocalProblemsOnRanks
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class TornDual:
         return kernel
 
     @cached_property
-    def parts(self) -> LocalProblems | LocalProblemsOnRanks:
+    def parts(self) -> Substructures:
         """The local problems for certificates."""
         return parts_of(self.served)
 

@@ -9,7 +9,7 @@ with the factor of K per step.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -25,13 +25,7 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.friction import FrictionLaw, friction_of
 from mortarbench.problems.contact.rows import ContactRows, without_fixed
-from mortarbench.problems.contact.stepping import (
-    LoadPath,
-    Stage,
-    State,
-    forces_of,
-    load_steps,
-)
+from mortarbench.problems.contact.stepping import Iterate, LoadPath, Stage, State
 from mortarbench.problems.duality.dualisation import (
     Transformed,
     dual_bounds,
@@ -96,72 +90,12 @@ class MonolithicLinearisation:
         return self.dual().interface_displacement(s), forces
 
 
-@dataclass(frozen=True, eq=False)
-class MonolithicPath(LoadPath[MonolithicLinearisation]):
-    """The load steps of undivided bodies."""
-
-    _answers: dict[int, Solution] = field(default_factory=dict, init=False)
-
-    def primal(self, k: int) -> QP:
-        """Return the primal QP of the last linearisation of step k ≥ 1.
-
-        The QP excludes the work of friction.
-        """
-        return self.problem(k).problem.primal
-
-    def answer(self, k: int) -> Solution:
-        """Return the solution of the primal problem of step k ≥ 1."""
-        if k not in self._answers:
-            last = self.problem(k)
-            self._answers[k] = last.problem.dual().recover(last.solution())
-        return self._answers[k]
-
-    def solution(self, k: int) -> Vector:
-        """Return the nondimensional displacement (n,) after step k; zero for k = 0."""
-        return self.answer(k).x if k else self.initial.u
+MonolithicPath = LoadPath[MonolithicLinearisation]
 
 
-def load_path(
-    bodies: Bodies,
-    linearise: Linearise,
-    factorise: Callable[[], GeneralisedInverse],
-    reference: Reference,
-    steps: int,
-    relin: int = 1,
-    *,
-    transform: Transform = dual_bounds,
-    laws: tuple[FrictionLaw, ...] = (),
-    quasi_static: bool = True,
-    initial_force: float = 0.0,
-) -> MonolithicPath:
-    """Return the load path of assembled bodies for a given linearisation of contact.
-
-    Parameters
-    ----------
-    factorise : function that returns the generalised inverse K⁺ that `transform`
-        requires; called once, before the first solve
-    laws : friction law of each contact pair; empty without friction
-    initial_force : normal force per slave node at the start of the fixed-point
-        iteration for Coulomb's law
-
-    """
-    stages = load_steps(
-        steps,
-        relin,
-        forces_of(bodies.f),
-        bodies.B_D.indices,
-        laws,
-        quasi_static=quasi_static,
-    )
-    return _path(
-        bodies,
-        stages,
-        lambda _: linearise,
-        lambda _: factorise(),
-        reference,
-        transform,
-        initial_force,
-    )
+def recovered(chosen: Iterate[MonolithicLinearisation]) -> Solution:
+    """Return the solution of the primal problem of an iterate."""
+    return chosen.problem.dual().recover(chosen.solution())
 
 
 @lru_cache(maxsize=4)
@@ -180,7 +114,7 @@ def monolithic_path(problem: ContactProblem, reference: Reference) -> Monolithic
             replace(bodies, B_D=support_rows(bodies.mesh, fixed))
         )
 
-    return _path(
+    return load_path(
         bodies,
         problem.stages,
         lambda laws: problem.linearise(bodies, laws),
@@ -191,15 +125,27 @@ def monolithic_path(problem: ContactProblem, reference: Reference) -> Monolithic
     )
 
 
-def _path(
+def load_path(
     bodies: Bodies,
     stages: Sequence[Stage],
     linearise: Callable[[tuple[FrictionLaw, ...]], Linearise],
     factorise: Callable[[Nodes], GeneralisedInverse],
     reference: Reference,
-    transform: Transform,
-    initial_force: float,
+    transform: Transform = dual_bounds,
+    initial_force: float = 0.0,
 ) -> MonolithicPath:
+    """Return the load path of assembled bodies.
+
+    Parameters
+    ----------
+    linearise : function that maps the friction laws of the pairs to the linearisation
+        of contact
+    factorise : function that maps the fixed components of a stage to the generalised
+        inverse K⁺ that `transform` requires; called once for each set of supports
+    initial_force : normal force per slave node at the start of the fixed-point
+        iteration for Coulomb's law
+
+    """
     # K⁺f of the full load is stored, because stages may share their load and supports
     bodies_by_stage = dict[tuple[int, int], Bodies]()
     inverses = dict[int, GeneralisedInverse]()
@@ -238,9 +184,7 @@ def _path(
         )
 
     zero, places = np.zeros(bodies.mesh.dofs), slave_places(bodies.pairs)
-    return MonolithicPath(
-        stages, pose, State(zero, zero, np.full(places, initial_force))
-    )
+    return LoadPath(stages, pose, State(zero, zero, np.full(places, initial_force)))
 
 
 def _unconstrained(bodies: Bodies, inverse: GeneralisedInverse) -> Vector:

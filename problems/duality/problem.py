@@ -7,10 +7,11 @@ processes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, wraps
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,6 @@ from mortarbench.problems.fem.mesh import (
     Nodes,
     StructuredGrid,
     join,
-    joined_sides,
 )
 
 if TYPE_CHECKING:
@@ -51,140 +51,27 @@ if TYPE_CHECKING:
 Linearise: TypeAlias = Callable[[Vector], ContactRows]
 
 
-class Shape(Protocol):
+class Shape(ABC):
     """Geometry of bodies; the mesh is generated on first use."""
 
     @property
-    def dim(self) -> int:
-        """Number of coordinates of a point."""
+    @abstractmethod
+    def joined(self) -> tuple[Mesh, Nodes]:
+        """Joined mesh of all bodies, m, and the body (E,) of each cell."""
 
-    @property
-    def mesh(self) -> Mesh:
-        """Joined mesh of all bodies, m."""
-
-    @property
-    def body(self) -> NDArray[np.int64]:
-        """Body of each cell, (E,)."""
-
-    @property
-    def sides(self) -> Mapping[str, Nodes]:
-        """Contact sides by name: chains of nodes in 2D, faces in 3D.
-
-        In 2D, this property does not generate the mesh.
-        """
-
+    @abstractmethod
     def layout(self, size: int) -> Subdivision:
         """Return a subdivision; the meaning of `size` depends on the shape."""
 
-
-B = TypeVar("B", StructuredGrid, HalfDisc)
-
-
-@dataclass(frozen=True, eq=False)
-class _Joined(Generic[B]):
-    """Plane bodies of parametric shape; their nodes are numbered body by body."""
-
-    parts: tuple[B, ...]
-    dim = 2
-
-    @cached_property
-    def _joined(self) -> tuple[Mesh, Nodes]:
-        return join(tuple(part.mesh() for part in self.parts))
-
     @property
     def mesh(self) -> Mesh:
         """Joined mesh of all bodies, m."""
-        return self._joined[0]
+        return self.joined[0]
 
     @property
     def body(self) -> NDArray[np.int64]:
         """Body of each cell, (E,)."""
-        return self._joined[1]
-
-    @cached_property
-    def sides(self) -> Mapping[str, Nodes]:
-        """Chains of nodes by name."""
-        return joined_sides(self.parts)
-
-
-class StructuredGrids(_Joined[StructuredGrid]):
-    """Structured grids; subdomains have at most size² cells."""
-
-    def layout(self, size: int) -> Subdivision:
-        """Cut each grid into blocks of at most `size` cells per side."""
-        from mortarbench.problems.feti.structured import Layout
-
-        return Layout.of(self.parts, size)
-
-
-class HalfDiscs(_Joined[HalfDisc]):
-    """Half discs; subdomains are blocks of cells between rings and radii."""
-
-    def layout(self, size: int) -> Subdivision:
-        """Cut each half disc into compact blocks of at most size² cells.
-
-        The cuts keep the aspect ratios of blocks near 1. The triangles at the centre
-        count as the last ring of cells.
-        """
-        from mortarbench.problems.feti.subdivision import half_discs_in_blocks
-        from mortarbench.problems.feti.tearing import compact_blocks
-
-        blocks = [compact_blocks(disc.lengths(), size) for disc in self.parts]
-        return half_discs_in_blocks(self.parts, blocks)
-
-
-@dataclass(frozen=True, eq=False)
-class StructuredSolids:
-    """Boxes of hexahedra, possibly deformed; subdomains are compact blocks of cells."""
-
-    #: one mesh per body, numbered as in `problems.fem.mesh.box`; the names of all
-    #: boundaries are distinct
-    parts: tuple[Mesh, ...]
-    #: numbers of cells of each box along x, y and z
-    divisions: tuple[tuple[int, int, int], ...]
-    dim = 3
-
-    @cached_property
-    def _joined(self) -> tuple[Mesh, Nodes]:
-        return join(self.parts)
-
-    @property
-    def mesh(self) -> Mesh:
-        """Joined mesh of all bodies, m."""
-        return self._joined[0]
-
-    @property
-    def body(self) -> NDArray[np.int64]:
-        """Body of each cell, (E,)."""
-        return self._joined[1]
-
-    @property
-    def sides(self) -> Mapping[str, Nodes]:
-        """Faces of the contact sides by name."""
-        return self.mesh.boundaries
-
-    def layout(self, size: int) -> Subdivision:
-        """Cut each box into compact blocks of at most `size` cells per side."""
-        from mortarbench.problems.feti.subdivision import mesh_in_subdomains
-        from mortarbench.problems.feti.tearing import compact_boxes
-
-        labels = [
-            compact_boxes(mesh.points.reshape(z + 1, y + 1, x + 1, 3), size)
-            for mesh, (x, y, z) in zip(self.parts, self.divisions, strict=True)
-        ]
-        first = np.cumsum([0] + [int(label.max()) + 1 for label in labels])
-        label = np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
-        named = np.unique(np.concatenate(list(self.sides.values())))
-        return mesh_in_subdomains(self.mesh, label, self.body, named)
-
-
-@dataclass(frozen=True, eq=False)
-class Meshed:
-    """Unstructured mesh; METIS cuts it into as many parts as `layout` receives."""
-
-    mesh: Mesh
-    body: NDArray[np.int64]
-    named: Nodes  #: nodes of supports and contact
+        return self.joined[1]
 
     @property
     def dim(self) -> int:
@@ -196,13 +83,100 @@ class Meshed:
         """Contact sides by name: chains of nodes in 2D, faces in 3D."""
         return self.mesh.boundaries
 
+    def _labelled(self, labels: Sequence[NDArray[np.int64]]) -> Subdivision:
+        """Return the subdivision with the labels (E,) of the cells of each body."""
+        from mortarbench.problems.feti.subdivision import Subdivision
+        from mortarbench.problems.feti.tearing import joined_labels
+
+        return Subdivision(self.mesh, joined_labels(labels), self.body)
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredGrids(Shape):
+    """Structured grids; subdomains have at most size² cells."""
+
+    parts: tuple[StructuredGrid, ...]
+
+    @cached_property
+    def joined(self) -> tuple[Mesh, Nodes]:
+        """Joined mesh of all bodies, m, and the body (E,) of each cell."""
+        return join(tuple(part.mesh() for part in self.parts))
+
+    def layout(self, size: int) -> Subdivision:
+        """Cut each grid into blocks of at most `size` cells per side."""
+        from mortarbench.problems.feti.structured import grids_in_blocks
+
+        return grids_in_blocks(self.parts, size, self.joined)
+
+
+@dataclass(frozen=True, eq=False)
+class HalfDiscs(Shape):
+    """Half discs; subdomains are blocks of cells between rings and radii."""
+
+    parts: tuple[HalfDisc, ...]
+
+    @cached_property
+    def joined(self) -> tuple[Mesh, Nodes]:
+        """Joined mesh of all bodies, m, and the body (E,) of each cell."""
+        return join(tuple(part.mesh() for part in self.parts))
+
+    def layout(self, size: int) -> Subdivision:
+        """Cut each half disc into compact blocks of at most size² cells.
+
+        The cuts keep the aspect ratios of blocks near 1. The triangles at the centre
+        count as the last ring of cells.
+        """
+        from mortarbench.problems.feti.tearing import compact_blocks, label_blocks
+
+        blocks = (compact_blocks(disc.lengths(), size) for disc in self.parts)
+        return self._labelled([label_blocks(cut) for cut in blocks])
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredSolids(Shape):
+    """Boxes of hexahedra, possibly deformed; subdomains are compact blocks of cells."""
+
+    #: one mesh per body, numbered as in `problems.fem.mesh.box`; the names of all
+    #: boundaries are distinct
+    parts: tuple[Mesh, ...]
+    #: numbers of cells of each box along x, y and z
+    divisions: tuple[tuple[int, int, int], ...]
+
+    @cached_property
+    def joined(self) -> tuple[Mesh, Nodes]:
+        """Joined mesh of all bodies, m, and the body (E,) of each cell."""
+        return join(self.parts)
+
+    def layout(self, size: int) -> Subdivision:
+        """Cut each box into compact blocks of at most `size` cells per side."""
+        from mortarbench.problems.feti.tearing import compact_boxes
+
+        grids = zip(self.parts, self.divisions, strict=True)
+        return self._labelled(
+            [
+                compact_boxes(mesh.points.reshape(z + 1, y + 1, x + 1, 3), size)
+                for mesh, (x, y, z) in grids
+            ]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Meshed(Shape):
+    """Unstructured mesh; METIS cuts it into as many parts as `layout` receives."""
+
+    given: tuple[Mesh, Nodes]  #: mesh and body (E,) of each cell
+
+    @property
+    def joined(self) -> tuple[Mesh, Nodes]:
+        """Mesh of all bodies, m, and the body (E,) of each cell."""
+        return self.given
+
     def layout(self, size: int) -> Subdivision:
         """Cut the bodies into `size` subdomains by graph partitioning."""
         from mortarbench.problems.feti.partition import graph_partition
-        from mortarbench.problems.feti.subdivision import mesh_in_subdomains
 
-        label = graph_partition(self.mesh.points, self.mesh.cells, self.body, size)
-        return mesh_in_subdomains(self.mesh, label, self.body, self.named)
+        mesh, body = self.joined
+        return self._labelled([graph_partition(mesh.points, mesh.cells, body, size)])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -279,16 +253,14 @@ class ElasticBodies:
 
 def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
     """Return meshed bodies as `ElasticBodies`; an assembled stiffness is kept."""
-    fixed = bodies.B_D.indices
-    named = np.concatenate([fixed, bodies.interface]) // bodies.mesh.dim
     result = ElasticBodies(
-        shape=Meshed(bodies.mesh, bodies.body, named),
+        shape=Meshed((bodies.mesh, bodies.body)),
         names=bodies.names,
         materials=bodies.materials,
         plane=bodies.plane,
         length=bodies.length,
         force=bodies.force,
-        fixed=fixed,
+        fixed=bodies.B_D.indices,
         forces=forces_of(bodies.f),
         pairs=bodies.pairs,
         piece=bodies.piece,
@@ -313,16 +285,6 @@ class InterfaceState(NamedTuple):
     friction: Friction
 
 
-class DisplacedMesh(NamedTuple):
-    """Cells of one body with their displacement."""
-
-    body: int  #: number of the body
-    mesh: Mesh  #: mesh of the cells, with N nodes
-    #: (N,) False for nodes that belong only to added layers of neighbouring cells
-    inner: NDArray[np.bool_]
-    u: Vector  #: (dim·N,) displacement, m
-
-
 class ContactSolution(Protocol):
     """Solution of a contact problem."""
 
@@ -336,9 +298,6 @@ class ContactSolution(Protocol):
 
     def at(self, component: Nodes) -> Vector:
         """Return the nondimensional displacement at global components (k,)."""
-
-    def meshes(self) -> Iterator[DisplacedMesh]:
-        """Yield displaced meshes, which together form all bodies."""
 
 
 def no_further_results(solution: ContactSolution) -> dict[str, Any]:

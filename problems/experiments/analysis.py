@@ -18,8 +18,9 @@ from mortarbench.problems.contact.bodies import Bodies, factorise_floating
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import fields
 from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.contact.stepping import forces_of, load_steps
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.monolithic import load_path
+from mortarbench.problems.duality.monolithic import load_path, recovered
 from mortarbench.problems.experiments.clock import Laps, Stopwatch, race
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
@@ -62,7 +63,7 @@ def analyse(
     inverse = factorise_floating(bodies, condense=condense)
     watch.lap("factor")
     rows_of = linearisation(bodies, "nts", "dual")
-    solutions: list[tuple[QP, Solution]] = []
+    duals: list[QP] = []
 
     def linearise(u: Vector) -> ContactRows:
         watch.lap("recovery")
@@ -76,20 +77,17 @@ def analyse(
         watch.lap("qp")
         if solution.status is not Status.SOLVED:
             raise RuntimeError(f"the dual QP was not solved: {solution.message}")
-        solutions.append((qp, solution))
+        duals.append(qp)
         return solution
 
+    stages = load_steps(steps, 1, forces_of(bodies.f), bodies.B_D.indices)
     path = load_path(
-        bodies, linearise, lambda: inverse, solve_dual, steps, transform=dualise
+        bodies, stages, lambda _: linearise, lambda _: inverse, solve_dual, dualise
     )
-    path.solution(steps)
+    answer = recovered(path.problem(steps))
     watch.lap("recovery")
-    laps = dict(watch.laps)
-
-    qp, solution = solutions[-1]
     last = path.problem(steps).problem
-    answer = dualise(last.primal, inverse).recover(solution)
-    return Analysis(bodies, last.primal, last.rows, answer, qp, laps)
+    return Analysis(bodies, last.primal, last.rows, answer, duals[-1], watch.laps)
 
 
 def scaling(plan: Plan, solve: Reference, baseline: Reference) -> Rows:

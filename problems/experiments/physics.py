@@ -11,11 +11,19 @@ from mortarbench.harness import Reference, Value
 from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
-from mortarbench.problems.duality.monolithic import MonolithicPath, load_path
+from mortarbench.problems.contact.stepping import Iterate, forces_of, load_steps
+from mortarbench.problems.duality.monolithic import (
+    MonolithicLinearisation,
+    MonolithicPath,
+    load_path,
+    recovered,
+)
+from mortarbench.problems.duality.problem import Linearise
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.families.hertz import HertzCylinder
 from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
 from mortarbench.problems.models.beam_ring import LENGTH, model
 
@@ -44,12 +52,26 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
     inverse, linearise = factorise_clamped(bodies), linearisation(bodies, "nts", "dual")
     variants = [(s, r) for r in plan.relin for s in plan.stepping]
     for steps, relin in (*variants, CONVERGED):
-        path = load_path(bodies, linearise, lambda: inverse, solve, steps, relin)
-        yield {"steps": steps, "relin": relin} | _results(bodies, path, steps)
+        path = _path(bodies, linearise, inverse, solve, steps, relin)
+        yield {"steps": steps, "relin": relin} | _results(bodies, path.problem(steps))
 
 
-def _results(bodies: Bodies, path: MonolithicPath, step: int) -> dict[str, Value]:
-    s, linearised = path.answer(step), path.problem(step).problem
+def _path(
+    bodies: Bodies,
+    linearise: Linearise,
+    inverse: GeneralisedInverse,
+    solve: Reference,
+    steps: int,
+    relin: int = 1,
+) -> MonolithicPath:
+    stages = load_steps(steps, relin, forces_of(bodies.f), bodies.B_D.indices)
+    return load_path(bodies, stages, lambda _: linearise, lambda _: inverse, solve)
+
+
+def _results(
+    bodies: Bodies, chosen: Iterate[MonolithicLinearisation]
+) -> dict[str, Value]:
+    s, linearised = recovered(chosen), chosen.problem
     values = quantities(bodies, linearised.primal, s, linearised.rows)
     sides = bodies.mesh.boundaries
     tip = s.x[dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)] * LENGTH
@@ -80,10 +102,11 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
     lengths = nodal_lengths(points)
     for contact in ("nts", "mortar"):
         linearise = linearisation(bodies, contact, "dual")
-        path = load_path(bodies, linearise, lambda: inverse, solve, plan.steps)
+        path = _path(bodies, linearise, inverse, solve, plan.steps)
         for step in range(1, plan.steps + 1):
-            s = path.answer(step)
-            on_nodes = (path.primal(step).G.T @ s.z).reshape(-1, 2)[slave]
+            chosen = path.problem(step)
+            pushed = chosen.problem.primal.G.T @ recovered(chosen).z
+            on_nodes = pushed.reshape(-1, 2)[slave]
             forces = np.hypot(*on_nodes.T) * bodies.force
             columns = zip(angles, lengths, forces, strict=True)
             for node, (angle, length, force) in enumerate(columns):

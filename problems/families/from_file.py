@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class FromFile(Family):
-    """QPs from files: npz, mat, QPS, Parquet, QPLIB, or JSON of Clarabel.
+    """QPs from files: npz, mat, QPS, Parquet, or JSON of Clarabel.
 
     ``file:PATH.parquet#ROW`` is one problem of a Parquet file, counted from 1. Text and
     mat files may be compressed: ``file:PATH.qps.gz``. The digest of the file is a

@@ -18,9 +18,8 @@ is that of the tetrahedral or wedge element.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,27 +84,25 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class StructuredGrid:
-    """Structured plane grid, any block of which can be generated separately.
+    """Structured plane grid with nx × ny cells.
 
     The node in row j and column i has the number j·(nx + 1) + i; cells are also
     numbered row by row.
     """
 
-    columns: Vector  #: (nx + 1,) parameter of each column of nodes
-    rows: Vector  #: (ny + 1,) parameter of each row of nodes
-    #: map from parameters of some columns (k,) and rows (l,) to points (l, k, 2)
-    place: Callable[[Vector, Vector], NDArray[np.float64]]
+    points: NDArray[np.float64]  #: (ny + 1, nx + 1, 2) points of the nodes, row by row
     names: tuple[str, str, str, str]  #: names of the sides, anticlockwise from row 0
 
     @property
     def divisions(self) -> tuple[int, int]:
         """Numbers of cells nx along a row and ny along a column."""
-        return self.columns.size - 1, self.rows.size - 1
+        rows, columns, _ = self.points.shape
+        return columns - 1, rows - 1
 
     @property
     def nodes(self) -> int:
         """Number of nodes."""
-        return self.columns.size * self.rows.size
+        return self.points.size // 2
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
@@ -115,36 +112,9 @@ class StructuredGrid:
         chains = across, up + nx, (up[-1] + across)[::-1], up[::-1]
         return dict(zip(self.names, chains, strict=True))
 
-    def block(self, columns: slice, rows: slice) -> NDArray[np.float64]:
-        """Return the points (l·k, 2) on l rows and k columns of nodes, row by row."""
-        points = self.place(self.columns[columns], self.rows[rows])
-        return np.asarray(np.ascontiguousarray(points.reshape(-1, 2)))
-
-    def side(self, name: str) -> NDArray[np.float64]:
-        """Return the points (k, 2) of a side, in the order of its chain."""
-        at, all_, last = self.names.index(name), slice(None), slice(-1, None)
-        if at in (0, 2):
-            points = self.block(all_, last if at else slice(1))
-        else:
-            points = self.block(last if at == 1 else slice(1), all_)
-        return np.asarray(points if at < 2 else points[::-1])
-
     def position(self, node: Nodes) -> NDArray[np.float64]:
-        """Return the points (k, 2) of nodes (k,), identical to those of `block`."""
-        row, column = np.divmod(node, self.columns.size)
-        points = np.empty((node.size, 2))
-        by_rows = np.unique(row).size <= np.unique(column).size
-        # one row or column at a time, because `place` evaluates all combinations of
-        # columns and rows
-        for line in np.unique(row if by_rows else column):
-            k = np.flatnonzero((row if by_rows else column) == line)
-            parameters = (
-                (self.columns[column[k]], self.rows[[line]])
-                if by_rows
-                else (self.columns[[line]], self.rows[row[k]])
-            )
-            points[k] = self.place(*parameters).reshape(-1, 2)
-        return points
+        """Return the points (k, 2) of nodes (k,)."""
+        return np.asarray(self.points.reshape(-1, 2)[node])
 
     def prefixed(self, prefix: str) -> StructuredGrid:
         """Return a copy with `prefix` added to the names of the sides."""
@@ -152,9 +122,10 @@ class StructuredGrid:
         return replace(self, names=(first, second, third, fourth))
 
     def mesh(self) -> Mesh:
-        """Return the whole mesh."""
-        cells = cells_of_block(self.columns.size, self.rows.size)
-        return Mesh(self.block(slice(None), slice(None)), cells, self.sides)
+        """Return the mesh."""
+        nx, ny = self.divisions
+        points = self.points.reshape(-1, 2)
+        return Mesh(points, cells_of_block(nx + 1, ny + 1), self.sides)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,11 +143,6 @@ class HalfDisc:
     names: tuple[str, str] = ("arc", "flat")  #: names of the sides
 
     @property
-    def divisions(self) -> tuple[int, int]:
-        """Number of cells per ring, and number of rings including the triangles."""
-        return self.angles.size - 1, self.radii.size
-
-    @property
     def nodes(self) -> int:
         """Number of nodes."""
         return self.angles.size * self.radii.size + 1
@@ -189,37 +155,12 @@ class HalfDisc:
         flat = np.concatenate([rings + a - 1, [a * r], rings[::-1]])
         return dict(zip(self.names, (np.arange(a), flat), strict=True))
 
-    @cached_property
-    def _direction(self) -> NDArray[np.float64]:
-        return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=-1)
-
     def position(self, node: Nodes) -> NDArray[np.float64]:
         """Return the points (k, 2) of nodes (k,)."""
         ring, angle = np.divmod(node, self.angles.size)
         radius = np.append(self.radii, 0.0)[ring][:, None]
-        return np.asarray(np.asarray(self.centre) + radius * self._direction[angle])
-
-    def block(self, angles: slice, rings: slice) -> tuple[Nodes, Nodes]:
-        """Return the nodes (k,) of a block of cells, and its cells (E, 4).
-
-        Corners of cells are indices into the returned nodes.
-
-        angles : range of the cells within each ring
-        rings : range of the rings
-        """
-        a, r = self.angles.size, self.radii.size
-        # the innermost ring consists of triangles with the centre as common corner
-        has_centre = rings.stop == r
-        i = np.arange(angles.start, angles.stop + 1)
-        j = np.arange(rings.start, rings.stop + (not has_centre))
-        nodes = (j[:, None] * a + i).ravel()
-        cells = cells_of_block(i.size, j.size)
-        if has_centre:
-            inner, last = np.arange(nodes.size - i.size, nodes.size), nodes.size
-            ends = [inner[:-1], inner[1:], *np.full((2, i.size - 1), last)]
-            nodes = np.append(nodes, a * r)
-            cells = np.concatenate([cells, np.stack(ends, axis=-1)])
-        return nodes, cells
+        direction = np.stack([np.cos(self.angles), np.sin(self.angles)], axis=-1)
+        return np.asarray(np.asarray(self.centre) + radius * direction[angle])
 
     def lengths(self) -> tuple[tuple[Vector, Vector], tuple[Vector, Vector]]:
         """Return the mean lengths of cells along radii and along arcs.
@@ -236,11 +177,13 @@ class HalfDisc:
         return replace(self, names=(arc, flat))
 
     def mesh(self) -> Mesh:
-        """Return the whole mesh."""
-        (a, r), all_ = self.divisions, np.arange(self.nodes)
-        return Mesh(
-            self.position(all_), self.block(slice(0, a), slice(0, r))[1], self.sides
-        )
+        """Return the mesh."""
+        a, r = self.angles.size, self.radii.size
+        inner = np.arange(a * (r - 1), a * r)
+        triangles = [inner[:-1], inner[1:], *np.full((2, a - 1), a * r)]
+        cells = [cells_of_block(a, r), np.stack(triangles, axis=-1)]
+        points = self.position(np.arange(self.nodes))
+        return Mesh(points, np.concatenate(cells), self.sides)
 
 
 def cells_of_block(columns: int, rows: int) -> Nodes:
@@ -258,12 +201,10 @@ def rectangle_grid(
     The sides are bottom, right, top and left.
     """
     nx, ny = divisions
-    return StructuredGrid(
-        columns=corner[0] + size[0] * np.arange(nx + 1) / nx,
-        rows=corner[1] + size[1] * np.arange(ny + 1) / ny,
-        place=lambda x, y: np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1),
-        names=("bottom", "right", "top", "left"),
-    )
+    x = corner[0] + size[0] * np.arange(nx + 1) / nx
+    y = corner[1] + size[1] * np.arange(ny + 1) / ny
+    points = np.stack(np.meshgrid(x, y), axis=-1)
+    return StructuredGrid(points, names=("bottom", "right", "top", "left"))
 
 
 def box(
@@ -362,17 +303,11 @@ def half_ring_grid(
     divisions : numbers of cells along the arc and across the ring
     """
     angles, layers = divisions
-
-    def place(theta: Vector, r: Vector) -> NDArray[np.float64]:
-        direction = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-        return np.asarray(np.asarray(centre) + r[:, None, None] * direction)
-
-    return StructuredGrid(
-        columns=np.pi * np.arange(angles + 1) / angles,
-        rows=radii[1] + (radii[0] - radii[1]) * np.arange(layers + 1) / layers,
-        place=place,
-        names=("outer", "left_foot", "inner", "right_foot"),
-    )
+    theta = np.pi * np.arange(angles + 1) / angles
+    r = radii[1] + (radii[0] - radii[1]) * np.arange(layers + 1) / layers
+    direction = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    points = np.asarray(centre) + r[:, None, None] * direction
+    return StructuredGrid(points, ("outer", "left_foot", "inner", "right_foot"))
 
 
 def rectangle(

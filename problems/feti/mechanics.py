@@ -66,11 +66,12 @@ def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
     kernel, rigid = [none], [none]
     for b, name in enumerate(problem.names):
         fixed, axes = node[body == b], axis[body == b]
-        if _prevents_motion(layout.position(fixed), axes, d):
+        if _prevents_motion(layout.mesh.points[fixed], axes, d):
             continue
-        nodes = layout.subdomain_nodes(np.arange(layout.count))
-        of_body = np.unique(nodes.number[problem.piece_of[nodes.subdomain] == b])
-        points, dofs = layout.position(of_body), dofs_of(of_body, d)
+        of_body = np.unique(
+            layout.torn.number[problem.piece_of[layout.torn.subdomain] == b]
+        )
+        points, dofs = layout.mesh.points[of_body], dofs_of(of_body, d)
         R = (
             rigid_modes(points)
             if d > 1

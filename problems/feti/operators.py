@@ -37,16 +37,15 @@ face.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array, vstack
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness import Vector
 from mortarbench.harness.distributed.factor import bordered_factor
@@ -61,7 +60,6 @@ from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.blocks import BlockDiagonal
 from mortarbench.problems.feti.subdomain_classes import (
-    Condensed,
     Dense,
     SubdomainClass,
     Subdomains,
@@ -88,7 +86,6 @@ class Group(NamedTuple):
     The components are those that B touches in any subdomain of the class on any rank.
     """
 
-    number: int  #: number of the class
     template: SubdomainClass
     explicit: bool  #: True if (K⁺)_bb is computed in advance
     members: NDArray[np.int64]  #: (S_g,) subdomains
@@ -158,8 +155,7 @@ def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pack
     groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
     parts = touched_components(B, domains)
     for k, members in domains.own:
-        group = Group(k, domains.template(k), bool(explicit[k]), members, parts[k])
-        groups.append(group)
+        groups.append(Group(domains.template(k), bool(explicit[k]), members, parts[k]))
         unknowns = domains.start[members] + parts[k][:, None]
         number[unknowns.ravel()] = np.arange(end, end + unknowns.size)
         end += unknowns.size
@@ -320,86 +316,14 @@ class DualOperator:
     @cached_property
     def _blocks(self) -> tuple[list[Any], list[Any]]:
         """(K⁺)_bb and S_bb of each group: matrices, triangles, or objects with `@`."""
-        groups, blocks = self.packed.groups, dict[int, tuple[Any, Any]]()
-        for group, condensed in condensed_groups(groups, self.domains):
-            blocks[group.number] = _explicit(group, condensed)
-        both = [blocks.get(g.number) or _implicit(g) for g in groups]
+        both = [
+            _explicit(g) if g.explicit else _implicit(g) for g in self.packed.groups
+        ]
         return [one[0] for one in both], [one[1] for one in both]
 
 
-def condensed_groups(
-    groups: Sequence[Group], domains: Subdomains
-) -> Iterator[tuple[Group, Condensed]]:
-    """Yield the explicit groups of this rank with their blocks (K⁺)_bb and S_bb.
-
-    If a class occurs on several ranks, one of them computes its blocks for all. Classes
-    are assigned in the order of decreasing work to the rank with the least work so far
-    (longest processing time first, Graham 1969). All ranks call this together.
-    """
-    comm, explicit = domains.comm, {g.number: g for g in groups if g.explicit}
-    work = {k: g.template.K.nnz * g.touched.size for k, g in explicit.items()}
-    offered = comm.bcast(comm.gather(work))
-    size = {k: w for one in offered for k, w in one.items()}
-    loads, computes = [0] * comm.size, dict[int, int]()
-    for k in sorted(size, key=lambda k: (-size[k], k)):
-        ranks = [r for r, one in enumerate(offered) if k in one]
-        computes[k] = min(ranks, key=loads.__getitem__)
-        loads[computes[k]] += size[k]
-    shared = {k for k in size if sum(k in one for one in offered) > 1}
-    blocks = dict[int, Condensed]()
-    for k, group in explicit.items():
-        if computes[k] == comm.rank:
-            blocks[k] = group.template.condense(group.touched)
-            if k not in shared:
-                yield group, blocks.pop(k)
-    for k in sorted(shared):
-        condensed: Any = comm.bcast(blocks.pop(k, None), computes[k])
-        if k in explicit:
-            yield explicit[k], condensed
-
-
-class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no types
-    """The operator F on rank 0; each product is a call of all ranks.
-
-    served : `problems.feti.served.Served` on rank 0
-    """
-
-    def __init__(self, served: Any) -> None:
-        m = served.operator.B.shape[0]
-        super().__init__(np.dtype(float), (m, m))
-        self._served = served
-        self.semidefinite = served.operator.semidefinite
-
-    def build(self) -> OperatorOnRanks:
-        """Factorise the subdomains on all ranks."""
-        self._served.lead("operator.prepare")
-        return self
-
-    def forget(self) -> None:
-        """Discard all factors; the next product computes them again."""
-        self._served.lead("forget")
-
-    def diagonal(self) -> Vector:
-        """Return the diagonal of F, (m,)."""
-        return np.asarray(self._served.lead("operator.diagonal"))
-
-    def preconditioner(self, kind: str, scaling: str) -> Product:
-        """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
-        outer, _ = self._served.lead("operator.preconditioner_parts", kind, scaling)
-        inner = partial(self._served.lead, "operator.precondition", kind, scaling)
-        return lambda x: outer(inner(outer(x)))
-
-    def _matvec(self, x: Vector) -> Vector:
-        return np.asarray(self._served.lead("operator", x))
-
-    def _matmat(self, X: Dense) -> Dense:
-        return np.asarray(self._served.lead("operator", X))
-
-    def _adjoint(self) -> OperatorOnRanks:
-        return self
-
-
-def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:
+def _explicit(group: Group) -> tuple[Any, Any]:
+    blocks = group.template.condense(group.touched)
     if group.members.size == 1:
         return upper_triangle(blocks.compliance), upper_triangle(blocks.schur)
     return blocks

@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
+from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness import Vector
 from mortarbench.harness.distributed.comm import Lead
-from mortarbench.harness.operators import SerialisableOperator
+from mortarbench.harness.mechanics import Substructures
+from mortarbench.harness.operators import Product, SerialisableOperator
 from mortarbench.problems.feti.operator_arrays import dual_operator
-from mortarbench.problems.feti.operators import (
-    DualOperator,
-    OperatorOnRanks,
-    explicit_classes,
-)
-from mortarbench.problems.feti.subdomain_classes import Subdomains
+from mortarbench.problems.feti.operators import DualOperator, explicit_classes
+from mortarbench.problems.feti.subdomain_classes import Dense, Subdomains
 from mortarbench.problems.feti.subdomains import TornBodies
-from mortarbench.problems.feti.substructures import (
-    LocalProblems,
-    LocalProblemsOnRanks,
-)
+from mortarbench.problems.feti.substructures import LocalProblems
 
 
 @dataclass(eq=False)
@@ -88,8 +85,56 @@ def operator_of(served: Served) -> SerialisableOperator | OperatorOnRanks:
     return OperatorOnRanks(served)
 
 
-def parts_of(served: Served) -> LocalProblems | LocalProblemsOnRanks:
-    """Return the local problems on rank 0."""
+def parts_of(served: Served) -> Substructures:
+    """Return the local problems on rank 0; on several ranks, methods call all ranks."""
     if served.torn.comm.size == 1:
         return served.parts
-    return LocalProblemsOnRanks(served)
+    methods = ("diagonal", "product", "squared_product", "solve")
+    on_ranks: Any = SimpleNamespace(
+        spread=served.parts.spread,
+        kernel=served.lead("parts.torn.domains.kernel"),
+        weight=served.lead("weights"),
+        **{name: partial(served.lead, f"parts.{name}") for name in methods},
+    )
+    return cast(Substructures, on_ranks)
+
+
+class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no types
+    """The operator F on rank 0; each product is a call of all ranks.
+
+    served : objects on rank 0
+    """
+
+    def __init__(self, served: Served) -> None:
+        m = served.operator.B.shape[0]
+        super().__init__(np.dtype(float), (m, m))
+        self._served = served
+        self.semidefinite = served.operator.semidefinite
+
+    def build(self) -> OperatorOnRanks:
+        """Factorise the subdomains on all ranks."""
+        self._served.lead("operator.prepare")
+        return self
+
+    def forget(self) -> None:
+        """Discard all factors; the next product computes them again."""
+        self._served.lead("forget")
+
+    def diagonal(self) -> Vector:
+        """Return the diagonal of F, (m,)."""
+        return np.asarray(self._served.lead("operator.diagonal"))
+
+    def preconditioner(self, kind: str, scaling: str) -> Product:
+        """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
+        outer, _ = self._served.lead("operator.preconditioner_parts", kind, scaling)
+        inner = partial(self._served.lead, "operator.precondition", kind, scaling)
+        return lambda x: outer(inner(outer(x)))
+
+    def _matvec(self, x: Vector) -> Vector:
+        return np.asarray(self._served.lead("operator", x))
+
+    def _matmat(self, X: Dense) -> Dense:
+        return np.asarray(self._served.lead("operator", X))
+
+    def _adjoint(self) -> OperatorOnRanks:
+        return self

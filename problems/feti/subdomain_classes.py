@@ -87,34 +87,21 @@ class SubdomainClass:
         of the Cholesky factor of K_ρ satisfies S_ρ = LLᵀ. S is the Schur complement on
         the union of the boundary and b, see `Condensed`.
         """
-        return self.blocks(b, self.border_factor(b))
-
-    def border(self, b: Nodes) -> Nodes:
-        """Return the components h of `condense`, ascending."""
-        return np.union1d(np.union1d(self.boundary, b), self.fixing)
-
-    def border_factor(self, b: Nodes) -> Dense:
-        """Return L (h, h) with S_ρ = LLᵀ, the most expensive part of `condense`."""
-        h = self.border(b)
+        h = np.union1d(np.union1d(self.boundary, b), self.fixing)
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
-        if (
-            i.size
-        ):  # order i to reduce fill; h stays last, so that L is the trailing block
+        if i.size:  # order i to reduce fill; h stays last, so that L is trailing
             i = i[analyze(with_int32(self.K[i][:, i]), use_long=False).P()]
         order = np.concatenate([i, h])
         K_rho = with_int32(self._fixed[order][:, order])
         factor = analyze(K_rho, ordering_method="natural", use_long=False)
         factor.cholesky_inplace(K_rho)
-        return np.asarray(factor.L()[i.size :, i.size :].toarray())
-
-    def blocks(self, b: Nodes, L: Dense) -> Condensed:
-        """Return (K⁺)_bb and S_bb, see `condense`, from the factor L of the border."""
-        g, h = np.union1d(self.boundary, b), self.border(b)
+        L = np.asarray(factor.L()[i.size :, i.size :].toarray())
         places_b, places_fixing = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
         C = cho_solve((L, True), np.eye(h.size)[:, places_b])[places_b]
         S = L @ L.T  # S_ρ; the next line subtracts ρR*R*ᵀ, which leaves S_h
         S[np.ix_(places_fixing, places_fixing)] -= self._fixing_term
-        S_bb, inner = S[np.ix_(places_b, places_b)], ~np.isin(h, g)
+        S_bb = S[np.ix_(places_b, places_b)]
+        inner = ~np.isin(h, np.union1d(self.boundary, b))
         if inner.any():  # S_bb excludes interior fixing components: eliminate them
             S_ib = S[inner][:, places_b]
             S_bb -= S_ib.T @ np.linalg.solve(S[inner][:, inner], S_ib)

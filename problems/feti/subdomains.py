@@ -43,8 +43,9 @@ from mortarbench.harness.distributed.mpi import too_few_parts
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.subdivision import (
     Integers,
+    Shaping,
     Subdivision,
-    SubdomainNodes,
+    TornNodes,
 )
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass, Subdomains
 from mortarbench.problems.feti.tearing import SubdomainMesh, classify
@@ -91,10 +92,7 @@ class DecomposedProblem:
     #: (bodies,) piece of each body; bodies of a piece have common nodes. None: every
     #: body is a piece
     piece: Integers | None = None
-    #: map from numbers of subdomains to a function that evaluates the factors of E at
-    #: their torn nodes, see `problems.feti.structured.Layout.shaping`; None if all
-    #: factors are 1
-    shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
+    shaping: Shaping | None = None  #: factors of E; None if all are 1
     load: Callable[[Nodes], Vector]  #: map from global components (k,) to forces (k,)
     fixed: Nodes  #: prescribed global components, in the order of their rows
     #: map from global components (k,) to prescribed displacements, or zero elsewhere;
@@ -155,16 +153,10 @@ class TornBodies:
     problem: DecomposedProblem
     comm: Comm = SERIAL
 
-    @cached_property
-    def nodes(self) -> SubdomainNodes:
+    @property
+    def nodes(self) -> TornNodes:
         """Torn nodes of all subdomains, (M,)."""
-        layout = self.problem.layout
-        return layout.subdomain_nodes(np.arange(layout.count))
-
-    def torn_nodes(self, subdomain: Nodes, node: Nodes) -> Nodes:
-        """Return the indices (k,) in `nodes` of copies of nodes (k,) in subdomains."""
-        nodes, N = self.nodes, np.int64(self.problem.layout.nodes)
-        return np.searchsorted(nodes.subdomain * N + nodes.number, subdomain * N + node)
+        return self.problem.layout.torn
 
     @cached_property
     def component(self) -> Nodes:
@@ -207,15 +199,14 @@ class TornBodies:
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
         """Subdomains in classes, and their rotations from the frames of the classes."""
         problem, of = self.problem, self.problem.layout
-        material, every = problem.material.tolist(), np.arange(of.count)
-        points = of.points(every)
-        first, class_of, rotation = classify(
-            list(zip(of.keys(every), material, strict=True)), points
-        )
+        material, every = problem.material.tolist(), range(of.count)
+        points = [of.points_of(s) for s in every]
+        keys = ((of.key(s), material[s]) for s in every)
+        first, class_of, rotation = classify(keys, points)
         of_class = [points[s] for s in first]
 
         def template(k: int) -> SubdomainClass:
-            cells = of.cells(int(first[k]))
+            cells = of.cells_of(first[k])
             of_cells = np.full(len(cells), material[first[k]])
             return problem.assemble_class(SubdomainMesh(of_class[k], cells, of_cells))
 
@@ -265,13 +256,6 @@ class TornBodies:
             shared[loaded] = np.einsum("mkq,mk->mq", rotation, shared[loaded])
         return np.asarray(load[self.free])
 
-    @cached_property
-    def _shape(self) -> Callable[[Nodes, Nodes, bool], Vector] | None:
-        shaping = self.problem.shaping
-        return (
-            None if shaping is None else shaping(np.arange(self.problem.layout.count))
-        )
-
     def row_stiffness(self, node: Nodes, *, supports: bool) -> Vector:
         """Return the factors (k,) at torn nodes whose square roots scale rows of B.
 
@@ -280,17 +264,15 @@ class TornBodies:
 
         supports : True for rows of supports, False for rows of gluing
         """
-        of, E_of = self.problem.layout, self.problem.E
+        of, E_of, number = self.problem.layout, self.problem.E, self.nodes.number[node]
         E = E_of[of.body[self.nodes.subdomain[node]]]
         if self.problem.piece is not None:
-            number = self.nodes.number[node]
             last = of.multiplicity(number) - 1
             for copy in range(int(last.max(initial=-1)) + 1):
                 body = of.body[of.holder(number, np.minimum(copy, last))]
                 E = np.minimum(E, E_of[body])
-        if self._shape is None:
-            return E
-        return np.asarray(E * self._shape(node, self.nodes.number[node], supports))
+        shaping = self.problem.shaping
+        return E if shaping is None else E * shaping(number, supports)
 
     @cached_property
     def rows(self) -> Rows:
@@ -312,7 +294,7 @@ class TornBodies:
         are reused because their assembly is expensive.
         """
         copy = replace(self, problem=problem)
-        same = ("nodes", "_classified", "component")
+        same = ("_classified", "component")
         vars(copy).update({k: v for k, v in vars(self).items() if k in same})
         return copy
 
@@ -396,7 +378,7 @@ def _copies(torn: TornBodies, node: Nodes) -> tuple[Nodes, Nodes, Nodes]:
     place = np.repeat(np.arange(multiplicity.size), multiplicity)
     first = np.cumsum(multiplicity) - multiplicity
     copy = np.arange(place.size) - first[place]
-    return place, copy, torn.torn_nodes(of.holder(node[place], copy), node[place])
+    return place, copy, of.index(node[place], copy)
 
 
 def _gluing_rows(torn: TornBodies) -> Entries:

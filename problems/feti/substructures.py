@@ -20,9 +20,8 @@ from mortarbench.problems.feti.subdomains import TornBodies
 class LocalProblems:
     """Local problems of torn bodies; see `harness.mechanics.Substructures`.
 
-    Stiffness matrices are factorised on first use. On several ranks, all ranks must
-    call each method together, and the results are valid on rank 0
-    (`LocalProblemsOnRanks`).
+    Stiffness matrices are factorised on first use. All processes call each method
+    together, and the results are valid on the first one.
     """
 
     torn: TornBodies
@@ -53,7 +52,7 @@ class LocalProblems:
         nodes = np.unique(csr_array(self.spread[:, at]).nonzero()[0] // d)
         number = np.full(self.spread.shape[0] // d, -1)
         number[nodes] = np.arange(nodes.size)
-        blocks = np.zeros((nodes.size, d, d))  # nodes of other ranks contribute zero
+        blocks = np.zeros((nodes.size, d, d))
         for template, place in domains.places():
             places = number[place[::d] // d]
             node, subdomain = np.nonzero(places >= 0)
@@ -101,49 +100,6 @@ class LocalProblems:
             image -= R @ (R.T @ image)
             solution[place] = image
         return domains.combined(solution)
-
-
-@dataclass(frozen=True, eq=False)
-class LocalProblemsOnRanks:
-    """Local problems on rank 0; each method is a call of all ranks.
-
-    served : `problems.feti.served.Served` on rank 0
-    """
-
-    served: Any
-
-    @property
-    def spread(self) -> csr_array:
-        """T (N, n), which maps displacements to torn unknowns."""
-        spread: csr_array = self.served.parts.spread
-        return spread
-
-    @cached_property
-    def kernel(self) -> csr_array:
-        """R (N, r), a basis of the rigid motions of all subdomains."""
-        kernel: csr_array = self.served.lead("parts.torn.domains.kernel")
-        return kernel
-
-    @cached_property
-    def weight(self) -> Vector:
-        """Sum of the diagonal entries of K at the node of each torn unknown, (N,)."""
-        return np.asarray(self.served.lead("weights"))
-
-    def diagonal(self, at: NDArray[np.int64]) -> Vector:
-        """Return the diagonal entries of TᵀKT for the columns `at` (k,) of T."""
-        return np.asarray(self.served.lead("parts.diagonal", at))
-
-    def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PKP to v (N,) in the precision of v."""
-        return np.asarray(self.served.lead("parts.product", v))
-
-    def squared_product(self, v: Vector) -> Vector:
-        """Apply K∘K, the squares of the entries of K, to v (N,)."""
-        return np.asarray(self.served.lead("parts.squared_product", v))
-
-    def solve(self, b: Vector) -> Vector:
-        """Apply PK⁺P to b (N,)."""
-        return np.asarray(self.served.lead("parts.solve", b))
 
 
 def _nodal(template: SubdomainClass, d: int) -> NDArray[np.float64]:

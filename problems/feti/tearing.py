@@ -164,6 +164,12 @@ def _first_cell(block: Sequence[slice]) -> list[int]:
     return [part.start for part in block]
 
 
+def joined_labels(labels: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Join the labels of the cells of several bodies, numbered body by body."""
+    first = np.cumsum([0, *(int(label.max()) + 1 for label in labels)])
+    return np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
+
+
 def label_blocks(cut: Sequence[Block]) -> NDArray[np.int64]:
     """Return the block of each cell, row by row."""
     shape = [max(block[k].stop for block in cut) for k in (0, 1)]

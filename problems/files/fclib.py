@@ -24,7 +24,6 @@ https://frictionalcontactlibrary.github.io.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,11 +34,9 @@ from numpy.typing import NDArray
 from scipy.sparse import block_array, coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-from mortarbench.harness import QP, InputError, Vector
+from mortarbench.harness import InputError, Vector
 from mortarbench.harness.checked import located
 from mortarbench.harness.files.datafile import check_size, opened, parsing
-from mortarbench.harness.files.durable import replacing
-from mortarbench.harness.sets.cones import Cones
 from mortarbench.problems.files.friction_cones import FrictionalContact
 
 SUFFIX = ".hdf5"
@@ -96,25 +93,6 @@ def read_datasets(path: Path) -> Datasets:
         check_size(f"{path}: its content", size)
         with parsing(path, wrong, 2 * size), file:
             return {name: np.asarray(node[()]) for name, node in datasets.items()}
-
-
-def write_datasets(path: Path, arrays: Datasets) -> None:
-    """Write arrays to an HDF5 file, with their types and shapes.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-
-    """
-    import h5py
-
-    try:
-        with replacing(path) as stream, h5py.File(stream, "w") as file:
-            for name, array in arrays.items():
-                file.create_dataset(name, data=array)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
 
 
 def read_fclib(path: Path) -> FclibFile:
@@ -264,87 +242,3 @@ class _Group:
                 f"{self.name}/{name} is not a matrix: its p, i and x do not fit "
                 f"{m} rows and {n} columns"
             ) from None
-
-
-def save_fclib(path: Path, qp: QP, meta: Mapping[str, Any], source: str = "") -> None:
-    """Write a QP over friction cones, or a copy of the FCLIB file `source`.
-
-    meta : metadata of plain types, stored in JSON as the description of the problem
-    source : path of an FCLIB file whose arrays are copied; if empty, `qp` is written
-
-    Raises
-    ------
-    InputError
-        If the format cannot represent the QP, or a file cannot be read or written.
-
-    """
-    if source:
-        arrays = read_datasets(Path(source))
-    else:
-        with located(str(path)):
-            title = str(meta.get("name", "QP"))
-            arrays = fclib_datasets(qp, title, json.dumps(dict(meta)))
-    write_datasets(path, arrays)
-
-
-def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
-    """Return a QP over friction cones as the arrays of a local problem.
-
-    Equality rows A r = b are stored as V = Aᵀ, s = −b and R = 0.
-
-    Raises
-    ------
-    InputError
-        If a variable belongs to no cone, the cones differ in dimension, the QP has
-        inequality rows or sets other than cones, or P is an operator.
-
-    """
-    cones = [one for one in qp.sets[1:] if isinstance(one, Cones)]
-    dims = {one.index.shape[1] for one in cones}
-    order = np.concatenate(
-        [np.zeros(0, np.int64), *(one.index.ravel() for one in cones)]
-    )
-    if (
-        len(dims) != 1
-        or dims - {2, 3}
-        or len(cones) < len(qp.sets) - 1
-        or order.size < qp.q.size
-        or qp.h.size
-    ):
-        raise InputError(
-            "FCLIB files store only friction cones of all variables, and equality "
-            "rows; expected a QP whose sets are Cones of 2 or 3 variables each, "
-            "without inequality rows"
-        )
-    if not qp.is_explicit:
-        raise InputError(
-            "P is an operator; expected a matrix, since FCLIB files store only matrices"
-        )
-    kind, names = "fclib_local", {"mu": np.concatenate([one.slope for one in cones])}
-    arrays = {f"{kind}/spacedim": np.array([dims.pop()], dtype=np.int32)}
-    matrices = {"W": csc_array(qp.P)[order][:, order]}
-    if qp.b.size:
-        matrices["V"] = csc_array(qp.A)[:, order].T
-        matrices["R"] = csc_array((qp.b.size, qp.b.size))
-        names["s"] = -qp.b
-    names["q"] = qp.q[order]
-    for name, M in matrices.items():
-        arrays |= {f"{kind}/{name}/{key}": part for key, part in _compressed(M).items()}
-    arrays |= {f"{kind}/vectors/{name}": vector for name, vector in names.items()}
-    texts = {"title": title, "description": description, "math_info": ""}
-    for name, text in texts.items():
-        arrays[f"{kind}/info/{name}"] = np.array(f"{text}\0".encode())
-    return arrays
-
-
-def _compressed(M: Any) -> Datasets:
-    """Return the arrays that store a matrix by columns."""
-    M = csc_array(M)
-    M.sum_duplicates()
-    sizes = {"nzmax": M.nnz, "m": M.shape[0], "n": M.shape[1], "nz": _COLUMNS}
-    return {
-        **{key: np.array([size], dtype=np.int32) for key, size in sizes.items()},
-        "p": M.indptr.astype(np.int32),
-        "i": M.indices.astype(np.int32),
-        "x": M.data,
-    }

@@ -11,7 +11,7 @@ from pathlib import Path
 from mortarbench.harness import InputError, Value
 from mortarbench.harness.errors import unknown
 
-COMPRESSIBLE = (".qps", ".mps", ".sif", ".qplib", ".mat")
+COMPRESSIBLE = (".qps", ".mps", ".sif", ".mat")
 FORMATS = (".npz", ".parquet", ".json", *COMPRESSIBLE)  #: suffixes of QP files
 
 

@@ -20,7 +20,6 @@ from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.reading import read_json
 from mortarbench.problems.files.clarabel_json import clarabel_qp
 from mortarbench.problems.files.file_digest import format_of
-from mortarbench.problems.files.qplib import parse_qplib
 from mortarbench.problems.files.qps import parse_qps
 from mortarbench.problems.files.two_sided import LoadedQP, TwoSidedQP, loaded
 
@@ -92,7 +91,6 @@ _READERS: dict[str, Callable[[Path], LoadedQP]] = {
     ".qps": _qps,
     ".mps": _qps,
     ".sif": _qps,
-    ".qplib": partial(_text, expected="a QPLIB file", parse=parse_qplib),
     ".json": _json,
 }
 

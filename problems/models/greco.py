@@ -79,7 +79,8 @@ def plate(n: int) -> Plate:
     grid = rectangle_grid((0.0, 0.0), (SIDE, SIDE), (n, n))
     sides = grid.sides
     top, left = (
-        (sides[name], nodal_lengths(grid.side(name))) for name in ("top", "left")
+        (sides[name], nodal_lengths(grid.position(grid.sides[name])))
+        for name in ("top", "left")
     )
     corner = sides["bottom"][-1:]
     return Plate(

@@ -50,12 +50,11 @@ from mortarbench.problems.fem.mesh import (
     Nodes,
     StructuredGrid,
     join,
-    joined_sides,
     rectangle_grid,
 )
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
-from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.structured import grids_in_blocks
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
     Contact,
@@ -191,8 +190,8 @@ class Membranes:
 
         rows : type of the rows that join copies of a node, the value of the key `glue`
         """
-        layout = Layout.of(self.grids, self.n)
-        sides = joined_sides(self.grids)
+        layout = grids_in_blocks(self.grids, self.n, self._joined)
+        sides = self.mesh.boundaries
         G = _contact_rows(sides, layout.nodes)
         return DecomposedProblem(
             layout=layout,

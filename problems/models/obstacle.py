@@ -63,8 +63,8 @@ from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
-from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdivision import mesh_in_subdomains
+from mortarbench.problems.feti.structured import grids_in_blocks
+from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
@@ -147,12 +147,12 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     p: Any = params
     if p["dim"] == 1:
         return _string_in_subdomains(p)
-    n, shape, all_ = p["n"], p["shape"], slice(None)
+    n, shape = p["n"], p["shape"]
     grid = _grid(n, shape)
-    layout = Layout.of((grid,), p["feti"])
+    layout = grids_in_blocks((grid,), p["feti"])
     boundary = np.unique(np.concatenate([*grid.sides.values()]))
     free = np.setdiff1d(np.arange(grid.nodes), boundary)
-    psi = obstacle_height(grid.block(all_, all_)[free], shape)
+    psi = obstacle_height(grid.position(free), shape)
     ends = np.arange(free.size + 1)
     rows = csr_array((np.full(free.size, -1.0), free, ends), (free.size, grid.nodes))
     return DecomposedProblem(
@@ -176,7 +176,7 @@ def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
     node = np.arange(n + 1)
     segments = np.stack([node[:-1], node[1:]], axis=-1)
     mesh, body = Mesh(problem.x, segments, {}), np.zeros(n, dtype=np.int64)
-    layout = mesh_in_subdomains(mesh, blocks((n,), p["feti"]), body, node)
+    layout = Subdivision(mesh, blocks((n,), p["feti"]), body)
     qp = problem.qp
     return DecomposedProblem(
         layout=layout,
@@ -195,12 +195,8 @@ def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
 def _grid(n: int, shape: str) -> StructuredGrid:
     """Return the grid of Ω ⊂ ℝ², numbered as in `nodes`, that is, fastest along y."""
     x = np.linspace(-HALF[shape], HALF[shape], n + 1)
-    return StructuredGrid(
-        columns=x,
-        rows=x,
-        place=lambda y, x: np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1),
-        names=("left", "top", "right", "bottom"),
-    )
+    points = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1)
+    return StructuredGrid(points, names=("left", "top", "right", "bottom"))
 
 
 def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:

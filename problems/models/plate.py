@@ -76,8 +76,8 @@ from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.spectrum import Spectrum, spectra
-from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_subdomains
+from mortarbench.problems.feti.structured import grids_in_blocks
+from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
@@ -282,10 +282,8 @@ def _layout(
 ) -> Subdivision:
     """Cut the plate into subdomains of `side` cells along the axes."""
     if isinstance(shape, StructuredGrids):
-        return Layout.of(shape.parts, side)
-    named = np.unique(np.concatenate(list(shape.sides.values())))
-    label = blocks(shape.divisions[0], side)
-    return mesh_in_subdomains(shape.mesh, label, shape.body, named)
+        return grids_in_blocks(shape.parts, side, shape.joined)
+    return Subdivision(shape.mesh, blocks(shape.divisions[0], side), shape.body)
 
 
 def _material(p: Mapping[str, Any]) -> NDArray[np.int64]:
@@ -320,7 +318,7 @@ def _clamped(sides: Mapping[str, Nodes], dim: int) -> Nodes:
 def _pull(layout: Subdivision, side: Nodes, kind: str) -> Forces:
     """Return the load, distributed over a side according to the key `load`."""
     nodes = nodes_of_side(side)
-    points = layout.position(nodes)
+    points = layout.mesh.points[nodes]
     dim = points.shape[1]
     if kind == "point":
         share = (nodes == nodes.max()).astype(float)

@@ -1,10 +1,16 @@
 """Stacks of boxes on the ground as FCLIB problems: an impact step of rigid bodies."""
 
+import h5py
 import numpy as np
 
-from mortarbench.problems.files.fclib import write_datasets
-
 SIDE, MASS, GRAVITY_STEP = 0.2, 3.0, 9.81e-3
+
+
+def write_datasets(path, arrays):
+    """Write arrays to an HDF5 file, with their types and shapes."""
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array)
 
 
 def box_stack(boxes=3, mu=0.4, seed=5):

@@ -17,9 +17,9 @@ from mortarbench.harness.files.parquetfile import save_parquet
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.mesh_files.reading import read_msh
-from mortarbench.problems.files.fclib import read_fclib, write_datasets
+from mortarbench.problems.files.fclib import read_fclib
 from tests.support.bounded import bounded
-from tests.support.box_stack import local_arrays, write_boxes
+from tests.support.box_stack import local_arrays, write_boxes, write_datasets
 from tests.support.mesh_formats import write_inp, write_med
 
 EXTREMES = (
@@ -58,33 +58,6 @@ QUADOBJ
 ENDATA
 """
 
-
-QPLIB = b"""TINY  # name
-CCL
-Minimize
-2
-1
-2  lower triangle
-1 1 2.0
-2 2 4.0
-0.0
-1
-1 -1.0
-3.0
-2
-1 1 1.0
-1 2 1.0
-1e20
--1e20
-0
-4.0
-0
-0.0
-1
-2 -1.0
-1e20
-0
-"""
 
 CLARABEL = b"""{"P": {"m": 2, "n": 2, "colptr": [0, 1, 3], "rowval": [0, 0, 1],
 "nzval": [2.0, -0.5, 2.0]}, "q": [1.0, -1.0], "A": {"m": 3, "n": 2,
@@ -156,7 +129,7 @@ def seeds(folder):
     for more in (none, hostile):
         plain = {"P": np.eye(2), "q": np.ones(2), **more}
         written("npz", lambda path, a=plain: np.savez(path, **a))
-    found |= {"qps": [QPS], "qplib": [QPLIB], "json": [CLARABEL], "hdf5": []}
+    found |= {"qps": [QPS], "json": [CLARABEL], "hdf5": []}
     written("hdf5", lambda path: write_boxes(path, 1))
     one = local_arrays(np.eye(3), np.ones(3), np.ones(1))
     written("hdf5", lambda path: write_datasets(path, one))

@@ -24,7 +24,7 @@ from mortarbench.problems.duality.problem import elastic_bodies_of, qp_choice
 from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
-from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_subdomains
+from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomains import Contact, DecomposedProblem, TornBodies
 from mortarbench.problems.models.beam_ring import bodies as spectrum_of_beam_ring
 from mortarbench.problems.models.beam_ring import model
@@ -32,9 +32,8 @@ from mortarbench.solvers.reference.solve import reference_solution
 
 
 def labelled(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
-    """Return a subdivision by cell labels (E,) that lists all nodes."""
-    every = np.arange(len(bodies.mesh.points))
-    return mesh_in_subdomains(bodies.mesh, label, bodies.body, every)
+    """Return a subdivision by cell labels (E,)."""
+    return Subdivision(bodies.mesh, label, bodies.body)
 
 
 def decompose_by_labels(

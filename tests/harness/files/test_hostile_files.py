@@ -597,7 +597,7 @@ def test_the_undamaged_mesh_is_read(tmp_path):
 
 #: numbers of damaged files in the slow test: 3600 QPs, 500 of FCLIB, 3000 meshes
 COUNTS = {
-    **dict.fromkeys(("npz", "mat", "parquet", "qps", "qplib", "json"), 600),
+    **dict.fromkeys(("npz", "mat", "parquet", "qps", "json"), 600),
     "hdf5": 500,
     **dict.fromkeys(("msh", "inp", "med"), 1000),
 }

@@ -11,8 +11,9 @@ from mortarbench.harness import QP, Solution, Status, no_rows
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.stepping import forces_of, load_steps
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.monolithic import load_path, primal_qp
+from mortarbench.problems.duality.monolithic import load_path, primal_qp, recovered
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,
@@ -326,17 +327,18 @@ def test_a_path_of_many_steps_recovers_only_requested_steps(factorise, transform
         model(*geometry),
         Counted(getattr(bodies_of(*geometry), factorise)),
     )
+    linearise = linearisation(bodies, "nts", "dual")
     path = load_path(
-        bodies, linearisation(bodies, "nts", "dual"), lambda: inverse,
-        reference_solution, 6, transform=transform,
+        bodies, load_steps(6, 1, forces_of(bodies.f), bodies.B_D.indices),
+        lambda _: linearise, lambda _: inverse, reference_solution, transform,
     )  # fmt: skip
 
-    last = path.answer(6)
+    last = recovered(path.problem(6))
 
     assert inverse.solves == 2  # one for the load, and one for the last step
-    primal = path.primal(6)
+    primal = path.problem(6).problem.primal
     assert kkt_residuals(primal, last).worst <= 1e-6
-    path.answer(3), path.answer(3)
+    recovered(path.problem(3))
     assert inverse.solves == 3
 
 

@@ -15,7 +15,6 @@ from mortarbench.harness.mechanics import Real
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.feti.served import Served, operator_of, parts_of
-from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import Contact, TornBodies, subdomain_ranks
 from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.solve import reference_solution
@@ -170,17 +169,11 @@ def test_cases_without_subdomains_are_not_built_on_ranks(name):
     assert case.family.subdomains(case.form, case.params) == 1
 
 
-def used(problem, size, monkeypatch):
+def used(problem, size):
     """Apply F on ranks.
 
-    Return the subdomains, the number of classes that each rank assembled, and the
-    number of classes of which a rank computed explicit blocks.
+    Return the subdomains, and the number of classes that each rank assembled.
     """
-    condensed, condense = [], SubdomainClass.condense
-
-    def noted(kind, b):
-        condensed.append(b)
-        return condense(kind, b)
 
     def work(comm):
         assembled = []
@@ -194,25 +187,19 @@ def used(problem, size, monkeypatch):
         led(comm, served, lambda: F @ np.ones(F.shape[0]))
         return served.domains, len(assembled)
 
-    monkeypatch.setattr(SubdomainClass, "condense", noted)
     found = results_of(size, work)
-    return found[0][0], [n for _, n in found], len(condensed)
+    return found[0][0], [n for _, n in found]
 
 
 @pytest.mark.parametrize("size", [2, 3])
 @pytest.mark.parametrize(
     "name", ["membranes/S=2/n=3", "beam-ring/Nr=2/Nh=2/steps=1/feti=2"]
 )
-def test_ranks_assemble_classes_of_their_subdomains_and_share_blocks(
-    name, size, monkeypatch
-):
-    """A class that occurs on several ranks has its blocks computed once."""
-    domains, assembled, condensed = used(problem_of(f"{name}/dual"), size, monkeypatch)
+def test_ranks_assemble_only_classes_of_their_subdomains(name, size):
+    domains, assembled = used(problem_of(f"{name}/dual"), size)
     own = [set(domains.class_of[domains.rank == r].tolist()) for r in range(size)]
 
     assert assembled == list(map(len, own))
-    assert condensed == domains.sizes.size
-    assert sum(map(len, own)) > condensed  # some class occurs on several ranks
 
 
 def test_implicit_blocks_on_ranks_are_those_of_one_process(monkeypatch):

@@ -39,7 +39,7 @@ def torn(
     forces = Forces(down, np.full(down.size, -1.0))
     body = np.zeros(len(mesh.cells), dtype=np.int64)
     of = ElasticBodies(
-        shape=Meshed(mesh, body, fixed // 3), names=("box",), materials=(STEEL,),
+        shape=Meshed((mesh, body)), names=("box",), materials=(STEEL,),
         plane=None, length=1.0, force=STEEL.E, fixed=fixed, forces=forces, pairs=(),
     )  # fmt: skip
     (stage,) = load_steps(1, 1, forces, fixed)

@@ -6,7 +6,7 @@ import pytest
 from mortarbench.problems.duality.decomposed import longitudinal_share
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import half_ring_grid, join, rectangle_grid
-from mortarbench.problems.feti.structured import Layout, shape_factors, spacings
+from mortarbench.problems.feti.structured import lines, shape_factors, spacings
 from tests.support.glued import decompose, structured_bodies
 
 pytestmark = pytest.mark.together
@@ -20,24 +20,11 @@ GRIDS = (
 
 @pytest.fixture(scope="module", params=[1, 3, 4, 20])
 def torn(request):
-    """Return the layout of three grids in blocks, and their torn meshes."""
+    """Return the size of blocks of three grids, and the torn meshes of the grids."""
     mesh, body = join(tuple(grid.mesh() for grid in GRIDS))
     label = structured_bodies([grid.divisions for grid in GRIDS], request.param)
     whole = decompose(mesh.points, mesh.cells, label, body)
-    return Layout.of(GRIDS, request.param), whole
-
-
-@pytest.mark.parametrize("grid", GRIDS)
-def test_a_block_has_the_points_of_the_whole_mesh(grid):
-    mesh, (nx, ny) = grid.mesh(), grid.divisions
-    whole = mesh.points.reshape(ny + 1, nx + 1, 2)
-
-    for i, j in ((0, 0), (nx - 1, 0), (nx // 2, ny - 1)):
-        block = grid.block(slice(i, i + 2), slice(j, j + 2))
-        assert np.array_equal(block, whole[j : j + 2, i : i + 2].reshape(-1, 2))
-    for name, chain in mesh.boundaries.items():
-        assert np.array_equal(grid.sides[name], chain)
-        assert np.array_equal(grid.side(name), mesh.points[chain])
+    return request.param, whole
 
 
 def stiffest_saw_tooth(D, r):
@@ -76,35 +63,30 @@ def test_the_factor_is_the_stiffness_of_a_saw_tooth_relative_to_squares(nu, r):
 
 
 def test_the_factor_is_averaged_at_crosspoints_and_one_without_interfaces():
-    lines = np.array([[True, True], [True, False], [False, True], [False, False]])
-    both, row, column, none = shape_factors(np.array([[1.0, 2.0]] * 4), lines, 0.5)
+    along = np.array([[True, True], [True, False], [False, True], [False, False]])
+    both, row, column, none = shape_factors(np.array([[1.0, 2.0]] * 4), along, 0.5)
 
     assert both == pytest.approx((row + column) / 2)
     assert row > 1 > column
     assert none == 1
 
 
-def test_spacings_are_those_of_the_cells_around(torn):
-    layout, _ = torn
-    nodes = layout.subdomain_nodes(np.arange(layout.count))
-    of_blocks = layout.spacings(np.arange(layout.count))
-    whole = [
-        spacings(grid.mesh().points.reshape(grid.rows.size, -1, 2)) for grid in GRIDS
-    ]
-
-    assert np.array_equal(of_blocks, np.concatenate(whole)[nodes.number])
-    assert whole[0] == pytest.approx(np.tile([2 / 13, 0.05], (14 * 6, 1)))
+def test_spacings_are_those_of_the_cells_around():
+    assert spacings(GRIDS[0].points) == pytest.approx(np.tile([2 / 13, 0.05], (84, 1)))
 
 
 def test_sides_of_grids_count_as_lines_on_request(torn):
-    layout, whole = torn
-    at = layout.places(np.arange(whole.nodes))
-    inner, all_ = (layout.lines(at, ends=ends) for ends in (False, True))
+    most, whole = torn
+    inner, all_ = (
+        np.concatenate([lines(grid.divisions, most, ends=ends) for grid in GRIDS])
+        for ends in (False, True)
+    )
     on_side = np.zeros((whole.nodes, 2), dtype=bool)
-    for start, grid in zip(layout.node_start, GRIDS, strict=False):
+    start = np.cumsum([0] + [grid.nodes for grid in GRIDS])
+    for first, grid in zip(start, GRIDS, strict=False):
         bottom, right, top, left = grid.sides.values()
-        on_side[start + np.append(bottom, top), 0] = True
-        on_side[start + np.append(left, right), 1] = True
+        on_side[first + np.append(bottom, top), 0] = True
+        on_side[first + np.append(left, right), 1] = True
 
     assert np.array_equal(inner.sum(axis=1) > 0, np.bincount(whole.node) > 1)
     assert np.array_equal(all_, inner | on_side)

@@ -1,15 +1,11 @@
-"""Subdivisions without an undivided mesh, compared with torn meshes."""
+"""Subdivisions compared with torn meshes."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from mortarbench.problems.duality.problem import HalfDiscs, StructuredGrids
 from mortarbench.problems.fem.mesh import HalfDisc, half_ring_grid, join, rectangle_grid
-from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdivision import (
-    half_discs_in_blocks,
-    mesh_in_subdomains,
-)
 from mortarbench.problems.feti.subdomains import subdomain_ranks
 from mortarbench.problems.feti.tearing import compact_blocks, label_blocks
 from tests.support.decomposed_bodies import parts_of
@@ -36,7 +32,7 @@ def torn(bodies, label):
 
 def grids(most):
     label = structured_bodies([grid.divisions for grid in GRIDS], most)
-    return Layout.of(GRIDS, most), *torn(GRIDS, label)
+    return StructuredGrids(GRIDS).layout(most), *torn(GRIDS, label)
 
 
 def discs(most):
@@ -44,24 +40,12 @@ def discs(most):
     labels = [np.zeros(0, dtype=np.int64)]
     for own in blocks:
         labels.append(label_blocks(own) + labels[-1].max(initial=-1) + 1)
-    return half_discs_in_blocks(DISCS, blocks), *torn(DISCS, np.concatenate(labels))
-
-
-def mesh(most):
-    """Return the subdivision of the grids as a mesh with all nodes listed."""
-    _, whole, body, parts = grids(most)
-    label = structured_bodies([grid.divisions for grid in GRIDS], most)
-    return (
-        mesh_in_subdomains(whole, label, body, np.arange(parts.nodes)),
-        whole,
-        body,
-        parts,
-    )
+    return HalfDiscs(DISCS).layout(most), *torn(DISCS, np.concatenate(labels))
 
 
 @pytest.fixture(
     scope="module",
-    params=[(how, n) for how in (grids, discs, mesh) for n in (1, 3, 20)],
+    params=[(how, n) for how in (grids, discs) for n in (1, 3, 20)],
 )
 def known(request):
     """Return a subdivision and the torn undivided mesh."""
@@ -71,12 +55,9 @@ def known(request):
 
 def test_torn_nodes_are_numbered_as_in_the_torn_mesh(known):
     of, _, _, whole = known
-    nodes = of.subdomain_nodes(np.arange(of.count))
-
     assert of.nodes == whole.nodes
-    assert_array_equal(nodes.number, whole.node)
-    assert_array_equal(nodes.start, whole.start)
-    assert_array_equal(nodes.subdomain, whole.subdomain)
+    assert_array_equal(of.torn.number, whole.node)
+    assert_array_equal(of.torn.subdomain, whole.subdomain)
 
 
 def test_nodes_of_subdomains_are_counted_before_they_are_listed(known):
@@ -85,27 +66,16 @@ def test_nodes_of_subdomains_are_counted_before_they_are_listed(known):
     assert_array_equal(of.sizes, np.diff(whole.start))
 
 
-def test_some_subdomains_have_the_nodes_that_they_have_among_all(known):
-    of, _, _, whole = known
-    some = np.arange(of.count)[1::2]
-    nodes, all_ = of.subdomain_nodes(some), of.subdomain_nodes(np.arange(of.count))
-    kept = np.isin(whole.subdomain, some)
-
-    assert_array_equal(some[nodes.subdomain], whole.subdomain[kept])
-    for name in ("number", "multiplicity", "copy"):
-        assert_array_equal(getattr(nodes, name), getattr(all_, name)[kept])
-
-
 def test_copies_of_a_node_are_counted_in_the_order_of_their_subdomains(known):
     of, _, _, whole = known
-    nodes = of.subdomain_nodes(np.arange(of.count))
-    multiplicity = np.bincount(whole.node)
+    nodes, multiplicity = of.torn, np.bincount(whole.node)
     shared = np.flatnonzero(nodes.multiplicity > 1)
 
     assert_array_equal(nodes.multiplicity, multiplicity[whole.node])
     assert_array_equal(
         of.holder(nodes.number[shared], nodes.copy[shared]), nodes.subdomain[shared]
     )
+    assert_array_equal(of.index(nodes.number[shared], nodes.copy[shared]), shared)
     for n in np.flatnonzero(multiplicity > 1):
         assert nodes.copy[whole.node == n].tolist() == list(range(multiplicity[n]))
 
@@ -127,13 +97,13 @@ def test_nodes_of_equal_multiplicity_are_counted_from_the_first(known):
 
 def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
     of, mesh, body, whole = known
-    all_ = np.arange(of.count)
-    keys = [(key, b) for key, b in zip(of.keys(all_), of.body.tolist(), strict=True)]
+    keys = [(of.key(s), b) for s, b in enumerate(of.body.tolist())]
     nodes = np.split(whole.node, whole.start[1:-1])
-    found = [own[of.cells(s)] for s, own in enumerate(nodes)]  # cells in global numbers
+    # cells in global numbers
+    found = [own[of.cells_of(s)] for s, own in enumerate(nodes)]
 
-    for points, own in zip(of.points(all_), nodes, strict=True):
-        assert_array_equal(points, mesh.points[own])
+    for s, own in enumerate(nodes):
+        assert_array_equal(of.points_of(s), mesh.points[own])
     assert sum(map(len, found)) == len(mesh.cells)
     rows = {row.tobytes(): b for row, b in zip(mesh.cells, body, strict=True)}
     for cells, b in zip(found, of.body, strict=True):
@@ -141,29 +111,22 @@ def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
     of_key = {}
     for s, key in enumerate(keys):
         first = of_key.setdefault(key, s)
-        assert_array_equal(of.cells(s), of.cells(first))
+        assert_array_equal(of.cells_of(s), of.cells_of(first))
 
 
 def test_sides_of_bodies_and_interfaces_have_subdomains_and_points(known):
     of, mesh, _, whole = known
     multiplicity = np.bincount(whole.node)
     for chain in (*mesh.boundaries.values(), np.flatnonzero(multiplicity > 1)):
-        assert_array_equal(of.position(chain), mesh.points[chain])
         assert_array_equal(of.multiplicity(chain), multiplicity[chain])
         first = np.searchsorted(np.sort(whole.node), chain)
         by_node = whole.subdomain[np.argsort(whole.node, kind="stable")]
         assert_array_equal(of.holder(chain), by_node[first])
 
 
-def test_neighbours_are_those_with_common_nodes(known):
+def test_glued_nodes_are_those_of_other_subdomains(known):
     of, _, _, whole = known
     own = [set(part) for part in np.split(whole.node, whole.start[1:-1])]
-    common = {(t, s): len(own[s] & own[t]) for s in range(len(own)) for t in range(s)}
-    one, other, nodes = of.shared_node_counts()
-
-    found = dict(zip(zip(one, other, strict=True), nodes, strict=True))
-    assert found == {pair: n for pair, n in common.items() if pair in found}
-    assert {pair for pair, n in common.items() if n > 2} <= set(found)
     glued = [sum(n in neighbour for n in mine) for mine, neighbour in _around(own)]
     assert of.glued().tolist() == glued
 

@@ -12,7 +12,7 @@ from mortarbench.problems.contact.stepping import Forces
 from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.mesh import box_grid, rectangle
-from mortarbench.problems.feti.subdivision import mesh_in_subdomains
+from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
@@ -294,7 +294,7 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     D, E = elasticity_matrix(Material(1.0, 0.3), "strain")[None], np.ones(1)
     held = 2 * mesh.boundaries["left"]
     load = np.arange(1.0, n + 1)
-    layout = mesh_in_subdomains(mesh, label, np.zeros_like(label), np.arange(n // 2))
+    layout = Subdivision(mesh, label, np.zeros_like(label))
     problem = DecomposedProblem(
         layout=layout, components=2, material=np.zeros(2, dtype=np.int64),
         assemble_class=partial(elastic_class, D=D, E=E), E=E, names=("plate",),

@@ -1,4 +1,4 @@
-"""FCLIB files: both loops, both forms, errors, the writer, independent readers."""
+"""FCLIB files: both loops, both forms, errors, independent readers."""
 
 import ctypes
 import json
@@ -12,20 +12,16 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from mortarbench.harness import QP, InputError
+from mortarbench.harness import InputError
 from mortarbench.harness.files.datafile import VARIABLE
-from mortarbench.problems.files.fclib import (
-    read_datasets,
-    read_fclib,
-    to_contact,
-    write_datasets,
-)
+from mortarbench.problems.files.fclib import read_fclib, to_contact
 from mortarbench.problems.files.friction_cones import FrictionalContact
 from tests.support.box_stack import (
     box_stack,
     global_arrays,
     local_arrays,
     write_boxes,
+    write_datasets,
 )
 
 LOOPS = ("cones", "tresca")
@@ -267,52 +263,6 @@ def test_a_stored_solution_that_is_a_dummy_is_named(tmp_path):
     assert case_of(path).remarks == ()
 
 
-def test_arrays_survive_the_round_trip_byte_by_byte(tmp_path):
-    write_regular(tmp_path / "boxes.hdf5", seed=1)
-    M, H, f, mu = box_stack(1, mu=2.0)  # all contacts stick after one problem
-    write_datasets(
-        tmp_path / "global.hdf5",
-        global_arrays(M, H, f, mu) | {"guesses/1/r": np.zeros(3)},
-    )
-    for name in ("boxes", "global"):
-        source, copy = tmp_path / f"{name}.hdf5", tmp_path / "copy.hdf5"
-        mb.export(f"fclib:{source}/iterate=1/dual", copy)
-        arrays, again = read_datasets(source), read_datasets(copy)
-        assert arrays.keys() == again.keys()
-        for key, array in arrays.items():
-            assert array.dtype == again[key].dtype
-            assert array.shape == again[key].shape
-            assert array.tobytes() == again[key].tobytes()
-
-
-def test_a_qp_over_cones_becomes_a_file(tmp_path):
-    """The cones permute the variables, and equality rows are stored as V and s."""
-    rng = np.random.default_rng(3)
-    M = rng.standard_normal((6, 6))
-    P, q, A = M @ M.T + np.eye(6), rng.standard_normal(6), rng.standard_normal((1, 6))
-    index = np.array([[5, 0, 2], [1, 4, 3]])
-    qp = QP.from_arrays(P, q, A=A, b=[0.3], sets=(mb.Cones(index, [0.4, 0.2]),))
-    mb.export(qp, tmp_path / "qp.hdf5")
-    contact = read_fclib(tmp_path / "qp.hdf5").contact
-    order = index.ravel()
-
-    assert contact.W.toarray() == pytest.approx(P[np.ix_(order, order)], abs=1e-15)
-    assert contact.q.tolist() == q[order].tolist()
-    assert contact.mu.tolist() == [0.4, 0.2]
-    assert contact.A.toarray().tolist() == A[:, order].tolist()
-    assert contact.b.tolist() == [0.3]
-    case = case_of(tmp_path / "qp.hdf5", "iterate=1", "dual")
-    x = np.zeros(6)
-    x[order] = case.recover(mb.solve(case, "scs", 1e-10).solution)
-    assert x == pytest.approx(mb.solve(qp, "scs", 1e-10).solution.x, abs=1e-7)
-
-
-def test_a_qp_without_cones_is_not_written(tmp_path):
-    with pytest.raises(InputError, match="store only friction cones of all variables"):
-        mb.export("contact-patch/dual", tmp_path / "patch.hdf5")
-    assert not list(tmp_path.iterdir())
-
-
 def test_contacts_without_friction_have_no_tangential_force(tmp_path):
     write_datasets(tmp_path / "smooth.hdf5", one_contact(mu=0.0))
     for loop in LOOPS:
@@ -364,7 +314,7 @@ print(json.dumps(dict(p=W.p[:W.n + 1], i=W.i[:W.p[W.n]], x=W.x[:W.p[W.n]], nz=W.
 
 
 @pytest.mark.slow
-def test_libfclib_reads_our_files_and_finds_the_same_error(tmp_path):
+def test_libfclib_reads_the_same_problem_and_finds_the_same_error(tmp_path):
     """The error of libfclib is divided by 1 + √‖q‖.
 
     If W is stored by rows, libfclib omits W r (issue 4); hence the file stores W by
@@ -376,8 +326,8 @@ def test_libfclib_reads_our_files_and_finds_the_same_error(tmp_path):
         pytest.skip("libfclib is not installed: apt install libfclib0")
     W, q, mu = write_boxes(tmp_path / "rows.hdf5")
     n = q.size
-    qp = QP.from_arrays(W, q, sets=(mb.Cones(np.arange(n).reshape(-1, 3), mu),))
-    mb.export(qp, tmp_path / "columns.hdf5")
+    arrays = local_arrays(W, q, mu) | {"fclib_local/W/nz": np.array([-1], np.int32)}
+    write_datasets(tmp_path / "columns.hdf5", arrays)
     contact = read_fclib(tmp_path / "columns.hdf5").contact
     r = 1e-2 * np.abs(np.random.default_rng(4).standard_normal(n))
     output = subprocess.run(
@@ -386,7 +336,6 @@ def test_libfclib_reads_our_files_and_finds_the_same_error(tmp_path):
     ).stdout  # fmt: skip
     seen = json.loads(output.splitlines()[-1])
 
-    arrays = read_datasets(tmp_path / "columns.hdf5")
     for key in "pix":
         assert seen[key] == arrays[f"fclib_local/W/{key}"].tolist()
     assert (seen["q"], seen["mu"]) == (q.tolist(), mu.tolist())
