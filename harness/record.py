@@ -19,7 +19,7 @@ SCHEMA = 3
 #: tolerance.
 VERIFIED_FACTOR = 10.0
 LARGEST_INTEGER = 2**63 - 1  #: largest integer that 64-bit formats (Parquet) can store
-LEVELS = 4  #: largest depth of nested lists and tables in a field
+LEVELS = 8  #: largest depth of nested lists and tables in a field
 #: fields whose values are equal in many lines; equal values are stored only once in
 #: memory
 _REPEATED = (

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
+from mortarbench.harness import Record
 from tests.support import ROOT
 
 DATA = ROOT / "tests" / "data"
@@ -36,6 +37,8 @@ def digits(entry, tol):
     case = entry["case"].replace("PATH", str(DATA))
     answer = mb.solve(case, entry["solver"], tol, ranks=entry["ranks"])
     assert answer.verdict == "verified", case
+    line = answer.record.to_json()
+    assert Record.from_json(line).to_json() == line  # a journal can be read back
     values = {k: v for k, v in answer.quantities.items() if k in QUANTITIES}
     return {"objective": answer.record.objective, **values}
 
