@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,17 @@ def positive(where: str, value: Any) -> float:
     """Check that `value` is a positive finite number, and return it as a float."""
     if not is_number(value) or not 0 < value <= sys.float_info.max:
         raise InputError(f"{where} = {shown(value)}; expected a positive number")
+    return float(value)
+
+
+def tolerance(value: Any) -> float:
+    """Check that a tolerance `value` is a number between 0 and 1; return a float."""
+    if (
+        not isinstance(value, Real)
+        or isinstance(value, bool)
+        or not 0 < float(value) < 1
+    ):
+        raise InputError(f"tol = {shown(value)}; expected a number between 0 and 1")
     return float(value)
 
 
@@ -120,6 +132,40 @@ def path(where: str, value: object) -> Path:
     return Path(text)
 
 
+def output_file(path_: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
+    """Check that a path is a valid name of an output file, and return the path.
+
+    Raises
+    ------
+    InputError
+        If the suffix is not in `suffixes`, the path is a folder, or the folder that
+        would contain the file is missing.
+
+    """
+    file = path("path", path_)
+    if file.suffix not in suffixes:
+        raise InputError(
+            f"{file}: unknown format {file.suffix!r}; expected {' or '.join(suffixes)}"
+        )
+    if file.is_dir():
+        raise InputError(f"{file} is a folder; expected a file")
+    if not file.parent.is_dir():
+        raise InputError(
+            f"{file}: the folder {file.parent} does not exist; expected "
+            "an existing folder"
+        )
+    return file
+
+
+def result_folder(where: str, value: object) -> Path:
+    """Check that `value` is the path of a folder, and return it as a Path."""
+    folder = path(where, value)
+    if not folder.is_dir():
+        what = "a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: {what}; expected a result folder of `run`")
+    return folder
+
+
 def texts(where: str, value: object) -> tuple[str, ...]:
     """Check that `value` is an iterable of strings, and return it as a tuple.
 
@@ -130,6 +176,15 @@ def texts(where: str, value: object) -> tuple[str, ...]:
         if all(isinstance(each, str) for each in entries):
             return entries
     raise InputError(f"{where} = {shown(value)}; expected a list of strings")
+
+
+def names(where: str, kind: str, value: object, known: Sequence[str]) -> list[str]:
+    """Check that `value` is an iterable of known names, and return them in a list."""
+    listed = texts(where, value)
+    for name in listed:
+        if name not in known:
+            raise unknown(kind, name, known, where=where)
+    return [*listed]
 
 
 def flag(where: str, value: object) -> bool:

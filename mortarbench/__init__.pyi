@@ -1,8 +1,5 @@
 from .answer import Answer as Answer
-from .answer import Multipliers as Multipliers
-from .answer import Verification as Verification
 from .answer import solve as solve
-from .answer import verify as verify
 from .case import build as build
 from .case import export as export
 from .harness.errors import InputError as InputError
@@ -34,5 +31,8 @@ from .validation import Conformance as Conformance
 from .validation import Validation as Validation
 from .validation import test_solver as test_solver
 from .validation import validate as validate
+from .verification import Multipliers as Multipliers
+from .verification import Verification as Verification
+from .verification import verify as verify
 
 __version__: str

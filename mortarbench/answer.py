@@ -1,80 +1,42 @@
-"""Functions that solve a case and verify the answer, or verify a given point."""
+"""Solution of a case, with the verdict on the answer.
+
+Modules that import numpy are imported when a case is solved, and not with this module,
+so that the command `solve` prints its help and refuses wrong input at once.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout, suppress
+from collections.abc import Mapping
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from sys import stderr
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-
-from mortarbench.arguments import (
-    ARCHIVES,
-    GRIDS,
-    PICTURES,
-    check_output_file,
-    check_scale,
-    solver_options,
-    tolerance,
-)
-from mortarbench.case import Case, as_case, build_case
-from mortarbench.harness import (
-    QP,
-    Fields,
-    Record,
-    Residuals,
-    Solution,
-    Solver,
-    Verdict,
-    checked,
-)
+from mortarbench.case import Case, as_case
+from mortarbench.harness import Record, Solver, Verdict, checked
 from mortarbench.harness.distributed.mpi import ranks_asked, too_few_parts
-from mortarbench.harness.environment.environment import digest
-from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.npz import write_mappable
-from mortarbench.harness.files.store import POINT
+from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.names import assemble
-from mortarbench.harness.processes.measurement import (
-    measure_once,
-    scratch_folder,
-    single_worker,
-)
-from mortarbench.harness.processes.protocol import Source
-from mortarbench.harness.processes.solver_file import write_solver
 from mortarbench.harness.processes.termination import ended_by_signals
-from mortarbench.harness.qp import Vector, numeric_vector
 from mortarbench.harness.record import finite
 from mortarbench.harness.registry import SolverSpec, check_solver, options_of, resolve
-from mortarbench.harness.solution import History
-from mortarbench.harness.verify.kkt import (
-    Normality,
-    allowed,
-    kkt_residuals,
-    normality,
-    verdict,
-)
-from mortarbench.harness.verify.multipliers import with_multipliers
-from mortarbench.harness.verify.verdicts import has_point, new_record, plain
-from mortarbench.registries import TURN, Plugins, Registries, one_thread
+from mortarbench.registries import TURN, Plugins, one_thread
 from mortarbench.text import outcome, outcome_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from numpy.typing import ArrayLike
 
+    from mortarbench.harness import Fields, Residuals, Solution
+    from mortarbench.harness.solution import History
+    from mortarbench.harness.verify.kkt import Normality
 
-#: Certified relative error in the energy norm above which `remarks` returns a remark on
-#: a verified answer.
-MAX_CERTIFIED_ERROR = 0.01
-#: Largest sum of contact forces, relative to the sum of loads, at which bodies count as
-#: not in contact. Interior-point methods return forces of about 1e-8 at open contacts;
-#: forces at closed contacts are far larger.
-MAX_OPEN_FORCE = 1e-6
+PICTURES = (".png", ".pdf", ".svg")  #: suffixes of pictures
+GRIDS = (".vtu", ".pvd")  #: suffixes of ParaView files: one state, or all steps
+ARCHIVES = (".npz",)  #: suffix of a written answer
+MAX_SCALE = 1e9  #: largest absolute magnification of displacements in pictures
 TIME_LIMIT = 300.0  #: default time limit of `solve`, in s
 
 
@@ -101,6 +63,8 @@ class Answer:
     @property
     def residuals(self) -> Residuals | None:
         """Relative KKT residuals, evaluated by the harness; None without a point."""
+        from mortarbench.harness import Residuals
+
         values: list[Any] = [getattr(self.record, name) for name in Residuals._fields]
         return None if None in values else Residuals(*values)
 
@@ -122,6 +86,8 @@ class Answer:
     @property
     def has_point(self) -> bool:
         """True if the solver returned a finite point."""
+        from mortarbench.harness.verify.verdicts import has_point
+
         return self.solution is not None and has_point(self.solution)
 
     @property
@@ -133,6 +99,8 @@ class Answer:
         """
         if "family_case" not in vars(self.case) or not self.has_point:
             return None
+        from mortarbench.harness.verify.kkt import allowed, normality
+
         assert self.solution is not None
         with one_thread():
             qp = self.case.family_case.qp
@@ -143,6 +111,8 @@ class Answer:
 
         The values of `normality` are included unless it is None.
         """
+        from mortarbench.harness.verify.verdicts import plain
+
         history = finite(plain(self.history))
         further = self.normality
         return {
@@ -208,7 +178,7 @@ class Answer:
             raise InputError("no picture: the case has neither bodies nor tractions")
         if path is None:
             return draw(figure)
-        return save(figure, check_output_file(path, PICTURES))
+        return save(figure, checked.output_file(path, PICTURES))
 
     def save(self, path: str | Path) -> Path:
         """Write x, y, z and z_box and, for bodies, displacements to an npz file.
@@ -222,7 +192,10 @@ class Answer:
             If the answer has no point, or the file cannot be written.
 
         """
-        path = check_output_file(path, ARCHIVES)
+        from mortarbench.harness.files.npz import write_mappable
+        from mortarbench.harness.files.store import POINT
+
+        path = checked.output_file(path, ARCHIVES)
         if self.solution is None or not self.has_point:
             raise InputError(f"{path}: {self.record.solver} returned no point")
         arrays = {name: getattr(self.solution, name) for name in POINT}
@@ -249,7 +222,7 @@ class Answer:
         """
         from mortarbench.reports.export.vtu import write_series, write_vtu
 
-        path, fields = check_output_file(path, GRIDS), self.fields()
+        path, fields = checked.output_file(path, GRIDS), self.fields()
         if not len(fields.cells):
             raise InputError(f"{path}: {self.case.name} has no bodies to write")
         if path.suffix == ".vtu":
@@ -260,7 +233,7 @@ class Answer:
             params = {**self.case.params, "step": step}
             case_id = assemble(self.case.id.family, params, self.case.form)
             earlier = solve(
-                build_case(case_id, self.case.registries),
+                Case(id=case_id, registries=self.case.registries),
                 self.solver,
                 self.record.tol,
                 options=self.spec.options,
@@ -290,117 +263,17 @@ class Answer:
         return f"<table>{''.join(rows)}</table>"
 
 
-def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str, ...]:
-    """Return reasons to doubt a verified answer, one line each.
-
-    Although the QP is solved, the certified bound may be large or infinite, or the
-    model may be inadequate: no node or only one node is in contact, or displacements
-    are too large for linear kinematics.
-    """
-    if record.status is not Verdict.VERIFIED or solution is None:
-        return ()
-    reasons = []
-    bound = record.energy_bound
-    if bound is not None and bound == np.inf:
-        reasons.append(
-            "the certificate does not bound the solver's error, because the "
-            "displacements may be as small as rounding errors, or because a load may "
-            "act on supports"
-        )
-    elif bound is not None and bound > MAX_CERTIFIED_ERROR:
-        reasons.append(
-            f"the solver's error is only certified to be at most {100 * bound:.2g} %; "
-            "a smaller tolerance may give a smaller bound"
-        )
-    # An exception in a remark must not make the solve fail. Displacements may be
-    # recovered by code of a plug-in, and if MPI ranks solved the QP, the case is not
-    # built in this process.
-    with suppress(Exception), one_thread():
-        if _is_open(case, record, solution):
-            reasons.append(
-                "no node is in contact, so the answer is the same as without contact "
-                "conditions; check the direction of the load and the initial gap"
-            )
-        elif _single_nodes(record):
-            reasons.append(
-                "a single node is in contact, so the computed pressure depends on the "
-                "mesh width and grows on finer meshes; refine the mesh near the contact"
-            )
-        if record.quantities.get("undetermined_friction"):
-            reasons.append(
-                "friction forces are not unique: where supports or other contact rows "
-                "prevent slip, other friction forces have the same displacements, so "
-                "that sums such as friction_force depend on the solver; remove the "
-                "friction or the supports along the contact"
-            )
-    with suppress(Exception), one_thread():
-        reasons += _large_displacements(case, solution)
-    return tuple(reasons)
-
-
-def _of_input(case: Case) -> tuple[str, ...]:
-    """Return the remarks on the input; () if only MPI ranks have built the case."""
-    return case.remarks if "family_case" in vars(case) else ()
-
-
-def _single_nodes(record: Record) -> bool:
-    """Return True if a pair with several rows is in contact at a single node."""
-    pairs = record.quantities.get("contacts", {}).values()
-    return any(pair.get("active") == 1 for pair in pairs) and (
-        record.quantities["contact_rows"] > len(pairs)
-    )
-
-
-def _is_open(case: Case, record: Record, solution: Solution) -> bool:
-    """Return True if contact forces sum to at most `MAX_OPEN_FORCE` times the loads."""
-    if not record.quantities.get("contact_rows"):
-        return False
-    if record.quantities.get("active") == 0:
-        return True
-    mechanics = case.family_case.mechanics if "family_case" in vars(case) else None
-    if mechanics is None:
-        return False
-    normal = mechanics.to_primal(solution).z[: mechanics.primal.h.size]
-    load = np.abs(mechanics.primal.q).sum()
-    return bool(np.abs(normal).sum() <= MAX_OPEN_FORCE * load)
-
-
-def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
-    """Yield a remark if, in linear kinematics, a body moves by more than its size."""
-    if "family_case" not in vars(case) or case.params.get("kinematics") == "finite":
-        return
-    mechanics = case.family_case.mechanics
-    if mechanics is None or mechanics.grid is None:
-        return
-    grid, u = mechanics.grid, case.family_case.recover(solution)
-    lengths = np.linalg.norm(u.reshape(grid.points.shape), axis=1)
-    worst, text = 1.0, ""
-    for body in np.unique(grid.bodies):
-        nodes = np.unique(grid.cells[grid.bodies == body])
-        size = float(np.ptp(grid.points[nodes], axis=0).max())
-        if lengths[nodes].max() > worst * size:
-            worst = float(lengths[nodes].max()) / size
-            name = repr(mechanics.names[body]) if mechanics.names else str(body)
-            text = (
-                f"body {name} moves by up to {lengths[nodes].max():.3g} m, which "
-                f"exceeds its size of {size:.3g} m; linear kinematics is valid only "
-                "for small displacements: check the moduli, the loads and the supports"
-            )
-    if text:
-        yield text
-
-
 @TURN
 @ended_by_signals()
 def solve(
-    case: Case | QP | str | object,
-    solver: str | Solver,
-    tol: float = 1e-8,
+    case: Annotated[object, "CASE"],
+    solver: Annotated[str | Solver, "--solver NAME"],
+    tol: Annotated[float, "T"] = 1e-8,
     *,
     options: Mapping[str, Any] | None = None,
     plugins: Plugins = (),
-    ranks: int = 1,
-    time_limit: float = TIME_LIMIT,
+    ranks: Annotated[int, "--mpi --ranks N"] = 1,
+    time_limit: Annotated[float, "SECONDS"] = TIME_LIMIT,
     **more: Any,
 ) -> Answer:
     """Run one solver on one case in a separate process, and verify its answer.
@@ -411,15 +284,17 @@ def solve(
 
     Parameters
     ----------
-    case : a case of `build`, its name, a QP, or a problem of qpsolvers or cvxpy
-    solver : a name listed by `solvers`, or an object with the methods `declines` and
-        `prepare`
+    case : FAMILY/key=value/…/FORM, such as beam-ring/Nr=4/Nh=3/dual; see docs/cases.md.
+        In Python also a case of `build`, a QP, or a problem of qpsolvers or cvxpy
+    solver : a name from `list solvers`. In Python also an object with the methods
+        `declines` and `prepare`
     tol : requested relative KKT accuracy
     options : options of the solver that differ from its defaults. A solver with an
         option ``history`` records its iterations unless ``history = False`` is passed
     plugins : Python files with more solvers or families
-    ranks : number of MPI processes that jointly solve the case
-    time_limit : limit for the solve, in s
+    ranks : number of MPI processes that jointly solve the case; more than 1 only for
+        cases that are decomposed into subdomains
+    time_limit : limit for the solve in s
     more : further options of the solver, as keyword arguments
 
     Raises
@@ -440,43 +315,13 @@ def solve(
     'iteration_limit'
 
     """
-    tol = tolerance(tol)
-    options = solver_options(options, more)
+    tol = checked.tolerance(tol)
+    requested = _merged(options, more)
     check_solver(solver)
     problem = as_case(case, plugins)
     ranks_asked(ranks, "ranks")
-    session = solver_session(
-        solver,
-        problem.registries,
-        options,
-        ranks=ranks,
-        time_limit=checked.positive("time_limit", time_limit),
-    )
-    with session as answer:
-        return answer(problem, tol)
-
-
-@contextmanager
-def solver_session(
-    solver: str | Solver,
-    registries: Registries,
-    options: Mapping[str, Any] | None = None,
-    *,
-    ranks: int = 1,
-    time_limit: float = TIME_LIMIT,
-) -> Iterator[Callable[[Case, float], Answer]]:
-    """Start a solver process; yield a function that solves a case to a tolerance.
-
-    solver, options, ranks, time_limit : see `solve`
-    registries : registries that contain the solver; the process loads the same plug-ins
-
-    Raises
-    ------
-    InputError
-        If there is no such solver or option.
-
-    """
-    requested = solver_options(options)
+    time_limit = checked.positive("time_limit", time_limit)
+    registries = problem.registries
     if isinstance(solver, str):
         name, solvers = solver, registries.solvers
     else:
@@ -491,144 +336,96 @@ def solver_session(
         defaults = {**defaults, "history": True}
         spec = replace(spec, options={**requested, "history": True})
         configured = resolve(spec, solvers)
-    environment = digest(registries.environment())
 
-    def answer(case: Case, tol: float) -> Answer:
-        record = new_record(
-            case.id,
-            spec,
-            options=options_of(configured),
-            tol=tol,
-            repeat=0,
-            environment=environment,
-        )
-        source = Source.FILE
-        if ranks > 1:
-            ours = registries.hold_only_builtins()
-            source = Source.RANKS if ours else Source.SHARES
-            parts = case.id.family.subdomains(case.id.form, case.id.params)
-            if parts < ranks:
-                record = record.replace(
-                    status=Verdict.DECLINED, message=too_few_parts(parts, ranks)
-                )
-                return Answer(
-                    case=case,
-                    record=record,
-                    solution=None,
-                    spec=spec,
-                    solver=solver,
-                    defaults=defaults,
-                )
-        # Code of a family may print, and standard output is reserved for the answer.
-        with one_thread(), redirect_stdout(stderr):
+    from mortarbench.harness.environment.environment import digest
+    from mortarbench.harness.processes.measurement import (
+        measure_once,
+        scratch_folder,
+        single_worker,
+    )
+    from mortarbench.harness.processes.protocol import Source
+    from mortarbench.harness.processes.solver_file import write_solver
+    from mortarbench.harness.verify.verdicts import new_record
+    from mortarbench.verification import remarks
+
+    record = new_record(
+        problem.id,
+        spec,
+        options=options_of(configured),
+        tol=tol,
+        repeat=0,
+        environment=digest(registries.environment()),
+    )
+    solution: Solution | None = None
+    notes: tuple[str, ...] = ()
+    source = Source.FILE
+    if ranks > 1:
+        ours = registries.hold_only_builtins()
+        source = Source.RANKS if ours else Source.SHARES
+        parts = problem.id.family.subdomains(problem.form, problem.params)
+    if ranks > 1 and parts < ranks:
+        message = too_few_parts(parts, ranks)
+        record = record.replace(status=Verdict.DECLINED, message=message)
+    else:
+        with ExitStack() as stack:
+            scratch = stack.enter_context(scratch_folder())
+            copy = None if isinstance(solver, str) else scratch / "solver.pickle"
+            if copy is not None:
+                write_solver(copy, configured)
+            command = registries.worker_command(spec, copy)
+            # The worker imports its libraries while this process builds the case.
+            worker = stack.enter_context(single_worker(command))
+            # Code of a family may print, and standard output is reserved for the answer
+            stack.enter_context(one_thread())
+            stack.enter_context(redirect_stdout(stderr))
             record, solution = measure_once(
                 worker,
-                lambda: case.family_case,
+                lambda: problem.family_case,
                 record,
                 registries.reference,
                 source=source,
                 time_limit=time_limit,
             )
-        return Answer(
-            case=case,
-            record=record,
-            solution=solution,
-            spec=spec,
-            solver=solver,
-            defaults=defaults,
-            remarks=(*_of_input(case), *remarks(case, record, solution)),
-        )
-
-    with scratch_folder() as scratch:
-        copy = None if isinstance(solver, str) else scratch / "solver.pickle"
-        if copy is not None:
-            write_solver(copy, configured)
-        with single_worker(registries.worker_command(spec, copy)) as worker:
-            yield answer
+        # remarks on the input are known only if this process has built the case
+        notes = problem.remarks if "family_case" in vars(problem) else ()
+        notes = (*notes, *remarks(problem, record, solution))
+    return Answer(
+        case=problem,
+        record=record,
+        solution=solution,
+        spec=spec,
+        solver=solver,
+        defaults=defaults,
+        remarks=notes,
+    )
 
 
-class Multipliers(NamedTuple):
-    """Multipliers with the signs of P x + q + Aᵀy + Gᵀz + z_box = 0, as in `QP`."""
-
-    y: Vector  #: (m,) multipliers of A x = b
-    z: Vector  #: (p,) multipliers of G x ≤ h
-    z_box: Vector  #: (n,) multipliers of the bounds
-
-
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Verification:
-    """Verdict of `verify` on a point."""
-
-    verdict: Verdict  #: `verified` or, if the point is refuted, `inaccurate` or `wrong`
-    residuals: Residuals  #: relative KKT residuals
-    #: multipliers passed to `verify`; those left out are computed
-    multipliers: Multipliers
-    objective: float  #: ½xᵀPx + qᵀx
-    #: additional error measures for discs and cones; None if the QP has no such sets
-    normality: Normality | None
-    tol: float  #: relative KKT accuracy, as passed to `verify`
-
-    def __repr__(self) -> str:
-        values = self.residuals._asdict().items()
-        error = ", ".join(f"{name} {value:.2g}" for name, value in values)
-        return f"<{self.verdict}: {error}; allowed {allowed(self.tol):.2g}>"
-
-
-def verify(
-    qp: QP | Case | str | object,
-    x: ArrayLike,
-    y: ArrayLike | None = None,
-    z: ArrayLike | None = None,
-    z_box: ArrayLike | None = None,
-    tol: float = 1e-8,
-) -> Verification:
-    """Verify a point by its KKT residuals, as the harness verifies answers of solvers.
-
-    Multipliers that are left out minimise the residuals in a linear program over the
-    nearly active rows, bounds and sets, see `harness.verify.multipliers`. If the
-    residuals are large even with these multipliers, the point is refuted.
-
-    Parameters
-    ----------
-    qp : a QP, a case of `build`, its name, or a problem of qpsolvers or cvxpy
-    x : (n,) point
-    y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, if known
-    tol : relative KKT accuracy; a point is verified if every residual is at most
-        10·tol (and at most 0.1), see docs/verdicts.md
+def check_scale(scale: float) -> float:
+    """Check a magnification of displacements, and return it.
 
     Raises
     ------
     InputError
-        If the size of a vector does not match the QP, or multipliers are left out and
-        the QP is too large to compute them.
-
-    Examples
-    --------
-    >>> import mortarbench as mb
-    >>> qp = mb.QP.from_arrays([[2.0, 0.0], [0.0, 2.0]], [-2.0, 2.0], lb=[0.0, 0.0])
-    >>> str(mb.verify(qp, [1.0, 0.0]).verdict), str(mb.verify(qp, [0.9, 0.0]).verdict)
-    ('verified', 'wrong')
+        If `scale` is NaN or its absolute value exceeds `MAX_SCALE`.
 
     """
-    tol = tolerance(tol)
-    case = as_case(qp)
-    problem = case.family_case.qp
-    sizes = {"x": problem.q, "y": problem.b, "z": problem.h, "z_box": problem.q}
-    arguments = {"x": x, "y": y, "z": z, "z_box": z_box}
-    vectors = {
-        name: numeric_vector(name, v, sizes[name].size)
-        for name, v in arguments.items()
-        if v is not None or name == "x"
-    }
-    with one_thread():
-        s = with_multipliers(problem, **vectors)
-        with np.errstate(all="ignore"):  # x may contain NaN or 1e300
-            residuals, objective = kkt_residuals(problem, s), problem.objective(s.x)
-    return Verification(
-        verdict=verdict(s.status, residuals, tol),
-        residuals=residuals,
-        multipliers=Multipliers(s.y, s.z, s.z_box),
-        objective=objective,
-        normality=normality(problem, s, allowed(tol)),
-        tol=tol,
-    )
+    if not abs(scale) <= MAX_SCALE:  # unlike `>`, this also rejects NaN
+        raise InputError(
+            f"scale = {scale:g}; expected a number of magnitude at most {MAX_SCALE:g}"
+        )
+    return scale
+
+
+def _merged(options: object, more: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge the options of a solver from a mapping, or None, and from keywords."""
+    options = {} if options is None else options
+    if not isinstance(options, Mapping) or not all(isinstance(k, str) for k in options):
+        raise InputError(
+            f"options = {shown(options)}; expected a dict that maps names to values, "
+            f"such as {{'max_iter': 50}}"
+        )
+    if twice := sorted(options.keys() & more.keys()):
+        raise InputError(
+            f"option {twice[0]!r} is given twice: in `options` and as a keyword"
+        )
+    return {**options, **more}

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from mortarbench.arguments import EXPORTS, check_output_file
-from mortarbench.harness import QP, Fields, Solution, plugin
+from mortarbench.harness import checked, plugin
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.names import CaseId, parse, unbuilt
-from mortarbench.harness.verify.verdicts import plain
 from mortarbench.registries import (
     TURN,
     Plugins,
@@ -22,7 +20,10 @@ from mortarbench.registries import (
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Mechanics, Vector
+    from mortarbench.harness import QP, Fields, Mechanics, Solution, Vector
+
+
+EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: suffixes of exported QPs
 
 
 class Case(plugin.Case):
@@ -116,6 +117,8 @@ class Case(plugin.Case):
     @TURN
     def quantities(self, solution: Solution) -> dict[str, Any]:
         """Return physical results of a solution, such as its energy, in SI units."""
+        from mortarbench.harness.verify.verdicts import plain
+
         return dict(plain(self.family_case.quantities(solution)))
 
     @TURN
@@ -142,7 +145,9 @@ class Case(plugin.Case):
             be written.
 
         """
-        path = check_output_file(path, EXPORTS)
+        path = checked.output_file(path, EXPORTS)
+        from mortarbench.harness.verify.verdicts import plain
+
         meta = plain(
             {
                 "name": self.name,
@@ -202,13 +207,19 @@ class BareQP(plugin.Family):
         return plugin.Case(qp=self.qp, recover=lambda s: s.x, quantities=lambda _: {})
 
 
-def as_case(problem: Case | QP | str | object, plugins: Plugins = ()) -> Case:
+def as_case(
+    problem: Case | QP | str | object,
+    plugins: Plugins = (),
+    registries: Registries | None = None,
+) -> Case:
     """Return the unbuilt case for a name, a QP, or a problem of qpsolvers or cvxpy.
 
     If `problem` is a case, the same case is returned, unless `plugins` contains files
     that its registries have not loaded.
 
     plugins : Python files with more families or solvers
+    registries : used for a name instead of built-in registries, installed plug-ins and
+        `plugins`
 
     Raises
     ------
@@ -217,23 +228,22 @@ def as_case(problem: Case | QP | str | object, plugins: Plugins = ()) -> Case:
         loaded.
 
     """
-    match problem:
-        case Case():
-            files = problem.registries.missing(plugins)
-            if not files:
-                return problem
-            registries = problem.registries.with_files(files)
-            extended = Case(id=problem.id, registries=registries)
-            if "family_case" in vars(problem):
-                extended.__dict__["family_case"] = problem.family_case
-            return extended
-        case QP():
-            family = BareQP(problem)
-            name = CaseId(family=family, name="qp", params={}, form="qp")
-            return Case(id=name, registries=load_registries(plugins))
-        case str():
-            registries = load_registries(plugins)
-            return Case(id=parse(problem, registries.families), registries=registries)
+    if isinstance(problem, str):
+        registries = load_registries(plugins, registries)
+        return Case(id=parse(problem, registries.families), registries=registries)
+    if isinstance(problem, Case):
+        if not (files := problem.registries.missing(plugins)):
+            return problem
+        registries = problem.registries.with_files(files)
+        extended = Case(id=problem.id, registries=registries)
+        if "family_case" in vars(problem):
+            extended.__dict__["family_case"] = problem.family_case
+        return extended
+    from mortarbench.harness import QP
+
+    if isinstance(problem, QP):
+        name = CaseId(family=BareQP(problem), name="qp", params={}, form="qp")
+        return Case(id=name, registries=load_registries(plugins))
     # attributes are tested, since an import of qpsolvers takes a second
     if hasattr(problem, "get_problem_data"):
         return as_case(QP.from_cvxpy(problem), plugins)
@@ -247,15 +257,23 @@ def as_case(problem: Case | QP | str | object, plugins: Plugins = ()) -> Case:
 
 
 def export(
-    case: Case | QP | str | object, path: str | Path, *, plugins: Plugins = ()
+    case: Annotated[object, "CASE"],
+    path: Annotated[str | Path, "FILE.npz|mat|parquet|qps"],
+    *,
+    plugins: Plugins = (),
+    registries: Registries | None = None,
 ) -> Path:
     """Write a QP for other programs: .npz, .mat, .parquet or .qps.
 
     Parameters
     ----------
-    case : a name, a case of `build`, a QP, or a problem of qpsolvers or cvxpy
-    path : file to write; its suffix determines the format
+    case : FAMILY/key=value/…/FORM, such as beam-ring/Nr=4/Nh=3/dual; see docs/cases.md.
+        In Python also a case of `build`, a QP, or a problem of qpsolvers or cvxpy
+    path : file to write; the suffix selects the format: npz (NumPy), mat (MATLAB,
+        Octave), parquet (qpbenchmark), or qps
     plugins : Python files with more families
+    registries : used for a name instead of built-in registries, installed plug-ins and
+        `plugins`
 
     Raises
     ------
@@ -270,7 +288,7 @@ def export(
     'patch.npz'
 
     """
-    return as_case(case, plugins).save(path)
+    return as_case(case, plugins, registries).save(path)
 
 
 @TURN
@@ -292,20 +310,6 @@ def build(name: str, *, plugins: Plugins = ()) -> Case:
     ('dual', 4, True)
 
     """
-    registries = load_registries(plugins)
-    return build_case(parse(name, registries.families), registries)
-
-
-def build_case(case: CaseId, registries: Registries) -> Case:
-    """Build a case.
-
-    Raises
-    ------
-    InputError
-        If the family rejects the parameters, the code of a plug-in fails, or the memory
-        is insufficient.
-
-    """
-    new_case = Case(id=case, registries=registries)
-    _ = new_case.family_case
-    return new_case
+    case = as_case(name, plugins)
+    _ = case.family_case
+    return case

@@ -11,7 +11,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from html import escape as html_escape
+from datetime import timedelta
+from html import escape
 from threading import Event as Signal
 from threading import Thread
 from time import monotonic
@@ -43,7 +44,7 @@ class Event:
 Callback = Callable[[Event], object]
 
 
-class _Display:
+class _Silent:
     """Counters of completed measurements, which subclasses display."""
 
     def __init__(self) -> None:
@@ -64,51 +65,38 @@ class _Display:
         """Show a warning in a line that is not overwritten."""
 
     def advance(self, record: Record | None) -> None:
-        self.count(record)
-        self.changed()
-
-    def count(self, record: Record | None) -> None:
-        """Count a measurement as done and, with a record, as measured by this run."""
         self.done += 1
         self.measured += record is not None
+        self.changed(record)
 
     def left(self) -> str:
         """Return the estimated remaining time; empty before the first measurement."""
         seconds = monotonic() - self.began
         return remaining(self.measured, self.total - self.done, seconds)
 
-    def changed(self) -> None:
-        """Update the display after a change of the counters."""
+    def changed(self, record: Record | None = None) -> None:
+        """Update the display; `record` is the measurement that was just completed."""
 
 
-class _Silent(_Display):
-    """Display that shows nothing."""
-
-
-class _EventDisplay(_Display):
+class _Events(_Silent):
     """Display that calls a function of the user at every change."""
 
     def __init__(self, callback: Callback) -> None:
         super().__init__()
         self._callback = callback
 
-    def _tell(self, **what: Any) -> None:
+    def changed(self, record: Record | None = None) -> None:
         self._callback(
-            Event(done=self.done, total=self.total, **{"now": self.now, **what})
+            Event(done=self.done, total=self.total, now=self.now, record=record)
         )
 
-    def changed(self) -> None:
-        self._tell()
-
     def warn(self, text: str) -> None:
-        self._tell(warning=text)
-
-    def advance(self, record: Record | None) -> None:
-        self.count(record)
-        self._tell(record=record)
+        self._callback(
+            Event(done=self.done, total=self.total, now=self.now, warning=text)
+        )
 
 
-class _Warnings(_Display):
+class Warnings(_Silent):
     """Display that writes only warnings."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -116,25 +104,25 @@ class _Warnings(_Display):
         self._stream = stream
 
     def warn(self, text: str) -> None:
+        """Write a warning."""
         # The run must continue if the program that reads its output closes the pipe.
         with suppress(BrokenPipeError):
             print(text, file=self._stream, flush=True)
 
 
-class _Lines(_Warnings):
+class _Lines(Warnings):
     """Display that writes one line per measurement."""
 
     def start(self, total: int) -> None:
         super().start(total)
         self.warn(f"{total} measurement{'s' * (total != 1)}")
 
-    def advance(self, record: Record | None) -> None:
-        super().advance(record)
+    def changed(self, record: Record | None = None) -> None:
         if record is not None:
-            self.warn(f"{self.done}/{self.total} {measurement_line(record)}")
+            self.warn(f"{self.done}/{self.total} {_line(record)}")
 
 
-def measurement_line(record: Record) -> str:
+def _line(record: Record) -> str:
     """Return the result of a measurement in one line."""
     seconds = record.total_seconds
     detail = "" if seconds is None else f" in {seconds:.3g} s"
@@ -143,80 +131,62 @@ def measurement_line(record: Record) -> str:
     return f"{record.solver} on {record.case}: {record.status.words}{detail}"
 
 
-def is_notable(record: Record) -> bool:
-    """Return True if a measurement is neither verified nor declined."""
-    return not record.status.is_verified and record.status is not Verdict.DECLINED
+class _Bar(_Silent):
+    """Bar with a list of the measurements that are neither verified nor declined."""
+
+    def changed(self, record: Record | None = None) -> None:
+        if record is None or record.status.is_verified:
+            return
+        if record.status is not Verdict.DECLINED:
+            self.warn(_line(record))
 
 
-class _Bar(_Display):
-    """Progress bar of `rich`; `is_notable` measurements are printed above the bar."""
+class _Terminal(_Bar):
+    """Bar of `rich` on a terminal."""
 
     def __init__(self, bar: Any) -> None:
         super().__init__()
         self._bar = bar
         self._task = bar.add_task("starting", total=None, left=self.left)
 
-    def start(self, total: int) -> None:
-        super().start(total)
-        self._bar.update(self._task, total=total)
-
-    def say(self, text: str) -> None:
-        from rich.markup import escape
-
-        self._bar.update(self._task, description=escape(text))
-
     def warn(self, text: str) -> None:
+        self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def changed(self, record: Record | None = None) -> None:
         from rich.markup import escape
 
-        self._bar.console.print(escape(text), highlight=False, soft_wrap=True)
-
-    def advance(self, record: Record | None) -> None:
-        super().advance(record)
-        self._bar.advance(self._task)
-        if record is not None and is_notable(record):
-            self.warn(measurement_line(record))
+        state = {"total": self.total or None, "completed": self.done}
+        self._bar.update(self._task, description=escape(self.now), **state)
+        super().changed(record)
 
 
-class _Notebook(_Display):
-    """Progress bar in a notebook; `is_notable` measurements are listed above it."""
+class _Notebook(_Bar):
+    """Bar in a notebook."""
 
     def __init__(self) -> None:
         super().__init__()
-        from IPython.display import display
+        from IPython.display import HTML, display
 
+        self._html = HTML
         self._lines: list[str] = []
         self._updated = -_UPDATE_SECONDS
-        self._handle = display(_Html(""), display_id=True)
+        self._handle = display(HTML(""), display_id=True)
 
     def warn(self, text: str) -> None:
         self._lines.append(text)
-        self.changed()
 
-    def advance(self, record: Record | None) -> None:
-        if record is not None and is_notable(record):
-            self._lines.append(measurement_line(record))
-        super().advance(record)
-
-    def changed(self) -> None:
+    def changed(self, record: Record | None = None) -> None:
+        super().changed(record)
         if monotonic() - self._updated < _UPDATE_SECONDS and self.done < self.total:
             return
         self._updated = monotonic()
-        above = "".join(f"<div>{html_escape(line)}</div>" for line in self._lines)
+        above = "".join(f"<div>{escape(line)}</div>" for line in self._lines)
         self._handle.update(
-            _Html(
+            self._html(
                 f"{above}<progress value='{self.done}' max='{self.total or 1}'>"
-                f"</progress> {self.done}/{self.total} {self.left()} "
-                f"{html_escape(self.now)}"
+                f"</progress> {self.done}/{self.total} {self.left()} {escape(self.now)}"
             )
         )
-
-
-class _Html:
-    def __init__(self, text: str) -> None:
-        self._text = text
-
-    def _repr_html_(self) -> str:
-        return self._text
 
 
 def remaining(measured: int, to_do: int, seconds: float) -> str:
@@ -227,9 +197,8 @@ def remaining(measured: int, to_do: int, seconds: float) -> str:
     """
     if measured <= 0 or to_do <= 0:
         return ""
-    minutes, rest = divmod(round(seconds / measured * to_do), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02} left"
+    left = timedelta(seconds=round(seconds / measured * to_do))
+    return f"{left} left"
 
 
 def in_notebook() -> bool:
@@ -276,30 +245,21 @@ def display_on(stream: TextIO) -> Iterator[Progress]:
     if console.width >= _BAR_WIDTH:
         columns.insert(0, BarColumn(bar_width=20))
     with Bars(*columns, console=console, expand=True) as bar:
-        yield _Bar(bar)
-
-
-@contextmanager
-def warnings_on(stream: TextIO) -> Iterator[Progress]:
-    """Print only the warnings of a run to a stream."""
-    yield _Warnings(stream)
+        yield _Terminal(bar)
 
 
 @contextmanager
 def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
     """Provide the display for the argument `progress` of `mortarbench.run`."""
-    if progress is None and in_notebook():
+    if progress in (True, None) and in_notebook():
         yield _Notebook()
     elif progress is True:
-        if in_notebook():
-            yield _Notebook()
-        else:
-            with display_on(sys.stderr) as bar:
-                yield bar
+        with display_on(sys.stderr) as bar:
+            yield bar
     elif isinstance(progress, Progress):
         yield progress
     elif callable(progress):
-        yield _EventDisplay(progress)
+        yield _Events(progress)
     elif progress in (None, False):
         yield _Silent()
     else:

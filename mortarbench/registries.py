@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeAlias
 
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 TURN = ForkSafeLock()
 
 #: Python files that define SOLVERS or PROBLEMS; a string may have the form
-#: LABEL=FILE.py
-Plugins = Sequence[str | Path | PluginFile]
+#: LABEL=FILE.py. The text is the option of commands
+Plugins = Annotated[Sequence[str | Path | PluginFile], "--plugin [LABEL=]FILE.py"]
 
 
 class Reporter(Protocol):

@@ -8,33 +8,22 @@ from html import escape
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from msgspec import structs
 
 from mortarbench.harness import checked
-from mortarbench.harness.checked import text
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import FaultError, InputError
-from mortarbench.harness.files.store import (
-    Arrays,
-    digest_of,
-    load_solution,
-    point_arrays,
-)
 from mortarbench.harness.record import Record, finite
 from mortarbench.harness.results.folder import differences, same_machine
-from mortarbench.harness.results.stored_run import (
-    StoredRun,
-    open_stored_run,
-    work_unit_of,
-)
-from mortarbench.harness.results.work_unit import BuildFailure, MeasurementFault, Result
-from mortarbench.harness.running.executor import local_engine
-from mortarbench.harness.solution import Status
 from mortarbench.registries import TURN, Plugins, Registries, load_registries
 from mortarbench.text import align
+
+if TYPE_CHECKING:
+    from mortarbench.harness.files.store import Arrays
+    from mortarbench.harness.results.stored_run import StoredRun
+    from mortarbench.harness.results.work_unit import Result
 
 _RESIDUALS = ("primal", "dual", "complementarity", "gap")
 _SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
@@ -89,8 +78,8 @@ class Replay:
 
 @TURN
 def replay(
-    folder: str | Path,
-    run_id: str,
+    folder: Annotated[str | Path, "DIR"],
+    run_id: Annotated[str, "RUN_ID"],
     *,
     plugins: Plugins = (),
     registries: Registries | None = None,
@@ -99,9 +88,9 @@ def replay(
 
     Parameters
     ----------
-    folder : result folder, as `run` writes it
-    run_id : `run_id` in a line of the journal, or its first digits; SESSION-RUN_ID if
-        several sessions contain the `run_id`
+    folder : result folder of `run`
+    run_id : run_id of a line of the journal, or SESSION-RUN_ID, or the first digits; an
+        HTML report shows it when the mouse points at a number
     plugins : Python files with more solvers or families
     registries : used instead of built-in registries, installed plug-ins and `plugins`
 
@@ -122,9 +111,14 @@ def replay(
 
     """
     registries = load_registries(plugins, registries)
-    path, solvers = checked.path("folder", folder), registries.solvers
+    run_id = checked.text("run_id", run_id)
+    path, solvers = checked.result_folder("folder", folder), registries.solvers
+    from mortarbench.harness.results.stored_run import open_stored_run, work_unit_of
+    from mortarbench.harness.results.work_unit import BuildFailure, MeasurementFault
+    from mortarbench.harness.running.executor import local_engine
+
     families = registries.families_with_copies(path)
-    stored = open_stored_run(path, text("run_id", run_id), families, solvers)
+    stored = open_stored_run(path, run_id, families, solvers)
     environment = registries.environment()
     unit = work_unit_of(stored, solvers, digest(environment))
     commands = registries.commands([stored.spec], path)
@@ -271,6 +265,11 @@ def _ratio_text(ratio: tuple[float, float, float], stored: Sequence[float]) -> s
 
 
 def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
+    import numpy as np
+
+    from mortarbench.harness.files.store import digest_of, load_solution, point_arrays
+    from mortarbench.harness.solution import Status
+
     if then.vectors is None or point is None:
         return None
     try:

@@ -7,9 +7,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from mortarbench.arguments import FORMATS, GATES, check_names
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import report_full_disk
@@ -20,6 +19,10 @@ if TYPE_CHECKING:
     from mortarbench.harness.running.pairs import Ratio
     from mortarbench.reports.compare.changes import Comparison, Pair
     from mortarbench.reports.compare.regressions import Slower
+
+
+FORMATS = ("html", "md", "tex", "csv", "parquet")  #: formats of a report
+GATES = ("worse", "slower")  #: values allowed in the argument `fail_on` of `report`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +62,11 @@ class Report:
 
 
 def report(
-    folder: str | Path,
-    *others: str | Path | None,
-    formats: Sequence[str] = FORMATS,
-    factor: float = VERIFIED_FACTOR,
-    fail_on: Sequence[str] = (),
+    folder: Annotated[str | Path, "DIR"],
+    *others: Annotated[str | Path | None, "DIR2"],
+    formats: Annotated[Sequence[str], "--format html,md,tex,csv,parquet"] = FORMATS,
+    factor: Annotated[float, "F"] = VERIFIED_FACTOR,
+    fail_on: Annotated[Sequence[str], "worse,slower"] = (),
     pool_forms: bool = False,
     registries: Registries | None = None,
 ) -> Report:
@@ -71,18 +74,16 @@ def report(
 
     Parameters
     ----------
-    folder : result folder; its report is written to the subfolder ``report``
-    others : further result folders. For each of them, a report on the changes from
-        `folder` to this further folder is written to its subfolder ``report``, instead
-        of the report on `folder`
-    formats : any of html, md, tex, csv, parquet
-    factor : a point is verified if every residual is at most factor·tol
-    fail_on : conditions that `Report.failed_on` lists if they are met: ``worse``, a
-        verdict became worse; ``slower``, a solver became slower by the criterion in
-        docs/statistics-growth.md
-    pool_forms : True to compute means, rankings and profiles over the cases of all
-        forms together, where a declined form counts as unsolved; False to compute them
-        within each form
+    folder : result folder of `run`; its report is written to its subfolder ``report``
+    others : report the changes from DIR to DIR2, and to each further folder, in
+        DIR2/report/against-DIR. The report on `folder` is then not written
+    formats : formats to write; default: all
+    factor : an answer is verified if every residual is at most F times the tolerance
+    fail_on : exit with 1 if, from DIR to DIR2, a verdict became worse (worse) or a
+        solver became slower by the criterion in docs/statistics-growth.md (slower). In
+        Python, `Report.failed_on` lists the conditions that are met
+    pool_forms : compute means, rankings and profiles over the cases of all forms
+        together, where a declined form counts as unsolved, not within each form
     registries : used instead of the built-in registries, for the function that writes
         the report
 
@@ -101,17 +102,15 @@ def report(
     'index.html'
 
     """
-    formats = checked.texts("formats", formats)
-    check_names("format", formats, FORMATS, "formats")
-    fail_on = checked.texts("fail_on", fail_on)
-    check_names("gate", fail_on, GATES, "fail_on")
+    formats = checked.names("formats", "format", formats, FORMATS)
+    fail_on = checked.names("fail_on", "gate", fail_on, GATES)
     factor = checked.positive("factor", factor)
     pool_forms = checked.flag("pool_forms", pool_forms)
     registries = load_registries((), Registries() if registries is None else registries)
-    first = checked.path("folder", folder)
-    after = [checked.path("others", other) for other in others if other is not None]
-    if fail_on and not after:
+    if fail_on and not any(others):
         raise InputError("fail_on needs a second folder; expected report DIR DIR2")
+    first = checked.result_folder("folder", folder)
+    after = [checked.result_folder("others", o) for o in others if o is not None]
     if not after:
         write = registries.report
         with report_full_disk(first):

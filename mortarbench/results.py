@@ -6,17 +6,15 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from mortarbench.arguments import PICTURES, check_output_file
+from mortarbench.answer import PICTURES
 from mortarbench.harness import checked
 from mortarbench.harness.checked import located
-from mortarbench.harness.environment.doctor import load_advice
-from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.errors import shown as given
 from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, toml
@@ -25,11 +23,7 @@ from mortarbench.harness.registry import is_solver, resolve
 from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import keep_environment, refuse_links
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.results.merge import merge as merge_folders
-from mortarbench.harness.running.executor import local_engine
 from mortarbench.harness.running.progress import Progress
-from mortarbench.harness.running.run import Missing
-from mortarbench.harness.running.run import run as run_suite
 from mortarbench.harness.suite.overrides import with_overrides
 from mortarbench.harness.suite.solver_options import listed_options
 from mortarbench.harness.suite.suite import as_toml, parse_suite, suite_file
@@ -44,6 +38,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from mortarbench.harness.results.work_unit import EngineFactory
+    from mortarbench.harness.running.run import Missing
 
 
 #: verdicts that refute the solver's claim
@@ -61,7 +56,7 @@ class Results:
     #: names of the requested cases; if empty, all cases in the records
     cases: frozenset[str] = frozenset()
     #: requested measurements that are missing; another call of `run` retries them
-    missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
+    missing: Missing | None = None
 
     @cached_property
     def df(self) -> DataFrame:
@@ -114,7 +109,9 @@ class Results:
     @property
     def shortfall(self) -> list[str]:
         """Reasons why requested measurements are missing, one line for each reason."""
-        lines = []
+        lines: list[str] = []
+        if self.missing is None:
+            return lines
         if count := len(self.missing.unbuilt):
             cases = "case" if count == 1 else "cases"
             names = some(self.missing.unbuilt)
@@ -148,7 +145,7 @@ class Results:
         from mortarbench.reports import figures
         from mortarbench.reports.render.saving import draw, save
 
-        target = None if path is None else check_output_file(path, PICTURES)
+        target = None if path is None else checked.output_file(path, PICTURES)
         available = figures(self.folder)
         names = [n for n in available if n.startswith(f"{kind}-")]
         names = [kind] if kind in available else names
@@ -230,7 +227,9 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
 
 
 def merge(
-    *folders: str | Path, out: str | Path, tell: Callable[[str], None] = ignore
+    *folders: Annotated[str | Path, "DIR"],
+    out: Annotated[str | Path, "DIR"],
+    tell: Callable[[str], None] = ignore,
 ) -> Results:
     """Merge result folders into a new folder or the result of an earlier merge.
 
@@ -240,8 +239,8 @@ def merge(
 
     Parameters
     ----------
-    folders : result folders
-    out : new folder, or result of an earlier merge
+    folders : result folders of `run` or `merge`
+    out : a new folder, or the result of an earlier merge, which is extended
     tell : called with messages about repeated measurements, files too large to be
         copied, and missing solutions and environments
 
@@ -255,7 +254,9 @@ def merge(
     """
     if not folders:
         raise InputError("no folder to merge; expected result folders of `run`")
-    sources = [checked.path("folders", folder) for folder in folders]
+    from mortarbench.harness.results.merge import merge as merge_folders
+
+    sources = [checked.result_folder("folders", folder) for folder in folders]
     target = checked.path("out", out)
     checked.function("tell", tell)
     records = merge_folders(sources, target, tell)
@@ -274,17 +275,17 @@ def _refuse_objects(solvers: object) -> None:
 
 @TURN
 def run(
-    suite: str | Path | Mapping[str, Any],
+    suite: Annotated[str | Path | Mapping[str, Any], "SUITE.toml"],
     *,
-    out: str | Path | None = None,
-    solvers: Sequence[str] = (),
-    cases: Sequence[str] = (),
-    repeats: int | None = None,
-    time_limit: float | None = None,
-    memory_limit: float | None = None,
+    out: Annotated[str | Path | None, "DIR"] = None,
+    solvers: Annotated[Sequence[str], "--solver NAME"] = (),
+    cases: Annotated[Sequence[str], "--case PATTERN"] = (),
+    repeats: Annotated[int | None, "N"] = None,
+    time_limit: Annotated[float | None, "SECONDS"] = None,
+    memory_limit: Annotated[float | None, "MIB"] = None,
     options: Mapping[str, Any] | None = None,
     fresh: bool = False,
-    dask: str | None = None,
+    dask: Annotated[str | None, "ADDRESS|local"] = None,
     plugins: Plugins = (),
     progress: bool | Callback | Progress | None = None,
     registries: Registries | None = None,
@@ -293,19 +294,20 @@ def run(
 
     Parameters
     ----------
-    suite : path of a TOML file, a name listed by `suites`, or a dict with the keys of
-        such a file; relative paths in a dict refer to the working directory
-    out : result folder; by default ``out/NAME`` for the suite NAME
-    solvers : names of the solvers to measure, which need not be in the suite; empty:
-        all solvers of the suite
-    cases : names or patterns of the cases to measure; empty: all cases of the suite
-    repeats, time_limit, memory_limit : override the values of the suite; the limits are
-        in s and MiB
+    suite : path of a TOML file, or a name from `list suites`. In Python also a dict
+        with the keys of such a file, whose relative paths refer to the working
+        directory
+    out : result folder; default: ``out/NAME`` for the suite NAME
+    solvers : measure only these solvers, which need not be in the suite
+    cases : measure only these cases: names or patterns such as ``*/dual``
+    repeats : number of repeats, instead of the number in the suite
+    time_limit : limit for each measurement in s, instead of the limit in the suite
+    memory_limit : limit for each measurement in MiB, instead of that in the suite
     options : options to set in every solver that has them; if the value of an option is
         a list, each value in the list is measured
     fresh : delete the previous results in the folder first
-    dask : address of a Dask scheduler, or ``local`` to start one; None to measure
-        without Dask
+    dask : measure on the workers of the Dask scheduler at this address, or (``local``)
+        of a scheduler that is started on this machine; see docs/cluster.md
     plugins : Python files with more solvers or families
     progress : True for a bar, or for lines if stderr is not a terminal; a function to
         be called with every `Event`; False for no display; None for a bar in a notebook
@@ -370,6 +372,11 @@ def run(
         memory_limit=memory_limit,
         options=listed_options({} if options is None else options),
     )
+    from mortarbench.harness.environment.doctor import load_advice
+    from mortarbench.harness.environment.environment import digest
+    from mortarbench.harness.running.executor import local_engine
+    from mortarbench.harness.running.run import run as run_suite
+
     environment = registries.environment()
     with shown(progress) as display, ExitStack() as stack:
         if load_advice(busy := os.getloadavg()[0]):

@@ -10,29 +10,21 @@ from dataclasses import dataclass
 from html import escape
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from mortarbench.harness import checked
-from mortarbench.harness.conformance import conformance
-from mortarbench.harness.conformance.conformance import (
-    INVARIANCE_PREFIX,
-    SOLUTION_PREFIX,
-    Grade,
-    Result,
-)
-from mortarbench.harness.crossval.comparison import Outcome, brief
-from mortarbench.harness.crossval.summary import as_data
-from mortarbench.harness.crossval.validation import validate_folder
 from mortarbench.harness.errors import InputError, shown, some, unknown
 from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.plugin import Solver
-from mortarbench.harness.processes.measurement import scratch_folder
-from mortarbench.harness.processes.solver_file import write_solver
-from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.registry import SolverSpec, check_solver, resolve
 from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, load_registries, one_thread
 from mortarbench.text import align, printable
+
+if TYPE_CHECKING:
+    from mortarbench.harness.conformance.conformance import Result
+    from mortarbench.harness.crossval.comparison import Outcome
+    from mortarbench.harness.processes.supervisor import WorkerProcess
 
 TIME_LIMIT = 10.0  #: time limit for each check of the conformance suite, in s
 MEMORY_LIMIT = 4096.0  #: memory limit for each check, in MiB
@@ -60,11 +52,10 @@ class Validation:
         return f"<pre>{escape(repr(self))}</pre>"
 
 
-@one_thread()
 def validate(
-    folder: str | Path,
+    folder: Annotated[str | Path, "DIR"],
     *,
-    budget: float = inf,
+    budget: Annotated[float, "SECONDS"] = inf,
     plugins: Plugins = (),
     progress: Callable[[str], None] = ignore,
     registries: Registries | None = None,
@@ -75,8 +66,8 @@ def validate(
 
     Parameters
     ----------
-    folder : result folder, as `run` writes it
-    budget : time in s after which no further case is begun
+    folder : result folder of `run`
+    budget : time in s after which no further case is begun; default: no limit
     plugins : Python files with more solvers or families
     progress : called with messages about the progress
     registries : used instead of built-in registries, installed plug-ins and `plugins`
@@ -94,13 +85,17 @@ def validate(
     True
 
     """
-    path = checked.path("folder", folder)
+    path = checked.result_folder("folder", folder)
     checked.function("progress", progress)
     if not checked.is_number(budget) or not budget >= 0:  # `not ≥` also rejects NaN
         raise InputError(f"budget = {shown(budget)}; expected a number of seconds ≥ 0")
     registries = load_registries(plugins, registries)
     families = registries.families_with_copies(path)
-    result = validate_folder(path, families, registries.reference, progress, budget)
+    from mortarbench.harness.crossval.summary import as_data
+    from mortarbench.harness.crossval.validation import validate_folder
+
+    with one_thread():
+        result = validate_folder(path, families, registries.reference, progress, budget)
     data = as_data(result, path.resolve().name)
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
@@ -111,6 +106,8 @@ def validate(
 
 def as_text(data: Mapping[str, Any]) -> str:
     """Return the data of `harness.crossval.summary.as_data` as text for a terminal."""
+    from mortarbench.harness.crossval.comparison import Outcome
+
     parts = [printable(data["headline"]), _solvers(data["solvers"])]
     for title, outcome in (
         ("Refuted claims", Outcome.REFUTED),
@@ -162,6 +159,8 @@ def _listed(answers: Sequence[Mapping[str, Any]], outcome: Outcome) -> list[str]
 
 
 def _e(value: float | None) -> str:
+    from mortarbench.harness.crossval.comparison import brief
+
     if value is None:
         return "-"
     return brief(value) if value else "0"
@@ -182,6 +181,8 @@ class Conformance:
     @property
     def objection(self) -> str:
         """Reason why the solver does not conform, or "" if it conforms."""
+        from mortarbench.harness.conformance.conformance import SOLUTION_PREFIX, Grade
+
         if self.failed:
             return f"fails {some(map(repr, self.failed))}"
         if not any(
@@ -194,7 +195,7 @@ class Conformance:
     @property
     def failed(self) -> Mapping[str, str]:
         """Messages of the failed checks, by name of the check."""
-        return {n: r.message for n, r in self.results.items() if r.grade is Grade.FAIL}
+        return {n: r.message for n, r in self.results.items() if r.grade == "fail"}
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data; ``test-solver --json`` prints the entry `checks`."""
@@ -205,18 +206,19 @@ class Conformance:
         return {"solver": self.solver, "conforms": self.conforms, "checks": checks}
 
     def __repr__(self) -> str:
+        from mortarbench.harness.conformance.conformance import Grade
+
         grades = Counter(r.grade for r in self.results.values())
         counts = ", ".join(f"{grades[g]} {g}" for g in Grade)
         return f"{align(self._rows())}\n{self.solver}: {counts}"
 
     def _rows(self) -> Iterator[tuple[str, str, str]]:
         """Yield grade, name and message of the checks; equal failures are one row."""
-        unfinished = (Grade.WEAK, Grade.FAIL)
         equal = Counter((r.grade, r.message) for r in self.results.values())
         seen = set()
         for name, r in self.results.items():
             message, count = r.message, equal[r.grade, r.message]
-            if r.grade in unfinished and count >= _EQUAL_FAILURES:
+            if r.grade in ("weak", "fail") and count >= _EQUAL_FAILURES:
                 if (r.grade, r.message) in seen:
                     continue
                 seen.add((r.grade, r.message))
@@ -232,7 +234,7 @@ def test_solver(
     *,
     plugins: Plugins = (),  # noqa: PT028  # not a test
     checks: Iterable[str] | None = None,  # noqa: PT028
-    time_limit: float = TIME_LIMIT,  # noqa: PT028
+    time_limit: Annotated[float, "SECONDS"] = TIME_LIMIT,  # noqa: PT028
     progress: Callable[[str], None] = ignore,  # noqa: PT028
     registries: Registries | None = None,  # noqa: PT028
 ) -> Conformance:
@@ -247,7 +249,7 @@ def test_solver(
     solver : a name listed by `solvers`, or an object as for `mortarbench.solve`
     plugins : Python files with more solvers
     checks : names of the checks to run; None for all
-    time_limit : limit for each check, in s
+    time_limit : limit for each check in s
     progress : called before each check with its number and name
     registries : used instead of built-in registries, installed plug-ins and `plugins`
 
@@ -267,17 +269,22 @@ def test_solver(
     checked.positive("time_limit", time_limit)
     checked.function("progress", progress)
     registries = load_registries(plugins) if registries is None else registries
-    names = list(conformance.CHECKS if checks is None else checks)
-    for check in names:
-        if check not in conformance.CHECKS:
-            raise unknown("check", str(check), conformance.CHECKS)
     name = solver if isinstance(solver, str) else type(solver).__name__
     spec = SolverSpec(name=name, label=name)
+    if isinstance(solver, str):
+        resolve(spec, registries.solvers)
+    from mortarbench.harness.conformance.conformance import CHECKS
+    from mortarbench.harness.processes.measurement import scratch_folder
+    from mortarbench.harness.processes.solver_file import write_solver
+    from mortarbench.harness.processes.supervisor import WorkerProcess
+
+    names = list(CHECKS if checks is None else checks)
+    for check in names:
+        if check not in CHECKS:
+            raise unknown("check", str(check), CHECKS)
     with scratch_folder() as scratch, ExitStack() as stack:
         copy = None
-        if isinstance(solver, str):
-            resolve(spec, registries.solvers)
-        else:
+        if not isinstance(solver, str):
             copy = scratch / "solver.pickle"
             write_solver(copy, solver)
         command = registries.worker_command(spec, copy)
@@ -295,6 +302,12 @@ def _run_check(worker: WorkerProcess, check: str, time_limit: float) -> Result:
 
     For a check of an equivalent formulation, a weakness is returned instead.
     """
+    from mortarbench.harness.conformance.conformance import (
+        INVARIANCE_PREFIX,
+        Grade,
+        Result,
+    )
+
     reply = worker.ask(
         {"check": check}, time_limit=time_limit, memory_limit=MEMORY_LIMIT
     )

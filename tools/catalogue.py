@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from mortarbench.cli.list_ import solvers_pages
+from mortarbench.cli.list import solvers_pages
 from mortarbench.listing import CATALOGUE, describe
 from mortarbench.solvers import SOLVERS
 

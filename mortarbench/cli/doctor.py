@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from argparse import Namespace
+from json import dumps
 
 from mortarbench.registries import Registries
 
 
-def run(registries: Registries, options: Namespace) -> int:
-    """Describe this machine, and recommend changes for better measurements."""
+def doctor(registries: Registries, *, json: bool = False) -> int:
+    """Check whether this machine is suitable for measurements, and recommend changes.
+
+    json : print JSON
+    """
     from rich.console import Console
 
     from mortarbench.harness.environment.doctor import as_json, examine, render
@@ -17,8 +19,8 @@ def run(registries: Registries, options: Namespace) -> int:
 
     environment = registries.environment()
     checks = examine(environment)
-    if options.json:
-        print(json.dumps(as_json(environment, checks)))
+    if json:
+        print(dumps(as_json(environment, checks)))
     else:
         text = render(checks, digest(environment))
         Console(highlight=False, soft_wrap=True).print(text)

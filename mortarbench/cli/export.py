@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
+from typing import Any
 
-from mortarbench.arguments import EXPORTS, check_output_file
-from mortarbench.harness.names import parse
+import mortarbench as mb
 from mortarbench.registries import Registries
 
 
-def run(registries: Registries, options: Namespace) -> int:
-    """Write the QP of a case to a file."""
-    check_output_file(options.file, EXPORTS)
-    registries = registries.with_files(options.plugin)
-    parsed = parse(options.case, registries.families)
-
-    from mortarbench.case import build_case
-
-    print(build_case(parsed, registries).save(options.file))
+def export(registries: Registries, **arguments: Any) -> int:
+    """Write the QP of a case to a file for other programs."""
+    print(mb.export(**arguments, registries=registries))
     return 0

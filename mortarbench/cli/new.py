@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Literal
 
 from mortarbench.harness.errors import InputError, say, shown
 from mortarbench.registries import Registries
@@ -20,9 +20,18 @@ _NEXT = {
 }
 
 
-def run(registries: Registries, options: Namespace) -> int:
-    """Write NAME.py or NAME.toml to the working directory, unless the file exists."""
-    kind, name = options.kind, options.name
+def new(
+    registries: Registries,
+    kind: Literal["solver", "problem", "suite"],
+    name: Annotated[str, "NAME"],
+) -> int:
+    """Write a template for a solver, a problem or a suite to the working directory.
+
+    The file passes all checks unchanged. Existing files are not overwritten.
+
+    kind : kind of the template
+    name : the file is NAME.py, or NAME.toml for a suite
+    """
     if not _NAME.fullmatch(name):
         raise InputError(
             f"name {shown(name)}; expected letters, digits, '-' and '_', "

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, say
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.registries import Registries
@@ -30,16 +30,26 @@ BEYOND: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def run(registries: Registries, options: Namespace) -> int:
-    """Perform the measurements, and write the figures and tables of the paper."""
+def paper(
+    registries: Registries,
+    *,
+    out: Annotated[str, "DIR"] = "out/paper",
+    quick: bool = False,
+) -> int:
+    """Reproduce all figures and tables of the paper.
+
+    out : folder for the results; default: out/paper
+    quick : use fewer sizes and repeats; takes about a minute
+    """
+    folder = checked.path("out", out)
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(
-            f"--out {options.out}: {e.strerror}; expected a folder, or a new path"
+            f"out {out}: {e.strerror}; expected a folder, or a new path"
         ) from None
-    with report_full_disk(options.out):
-        written = measure_and_write(registries, options.out, options.quick, say)
+    with report_full_disk(folder):
+        written = measure_and_write(registries, folder, quick, say)
     print(*(file for file in written if file.suffix == ".html"), sep="\n")
     return 0
 

@@ -2,77 +2,66 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from argparse import Namespace
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from json import dumps
+from typing import Annotated, Any
 
+import mortarbench as mb
 from mortarbench.harness.errors import some
-from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.suite.solver_options import parse_options
+from mortarbench.progress import Warnings
 from mortarbench.registries import Registries
 
-if TYPE_CHECKING:
-    from mortarbench.results import Results
 
+def run(
+    registries: Registries,
+    *,
+    option: Annotated[Sequence[str], "KEY=VALUE"] = (),
+    strict: bool = False,
+    quiet: bool = False,
+    json: bool = False,
+    **arguments: Any,
+) -> int:
+    """Measure a suite and write a report on the results.
 
-def run(registries: Registries, options: Namespace) -> int:
-    """Perform the missing measurements of a suite and write the report.
+    Results are stored in a folder. The same command continues an interrupted run
+    without repeating a measurement. Exit code 1: a measurement is missing.
 
-    Return 1 if a measurement is missing. With ``--strict``, also return 1 if a claim is
-    refuted or a solver crashed, gave up or reached a limit.
+    option : set an option of every solver that has it, or of one by SOLVER.KEY; if it
+        is set several times, every value is measured
+    strict : exit with 1 if a claim is refuted, or a solver fails or reaches a limit
+    quiet : print only warnings and missing measurements
+    json : print JSON
     """
-    registries = registries.with_files(options.plugin)
-    path: Path = registries.suite_path(options.suite)
-    changed = parse_options(options.option)
-
-    from mortarbench import results
-    from mortarbench.progress import display_on, warnings_on
-    from mortarbench.reporting import report
-
-    with (
-        warnings_on(sys.stderr) if options.quiet else display_on(sys.stderr) as progress
-    ):
-        measured = results.run(
-            path,
-            out=options.out,
-            solvers=options.solver,
-            cases=options.case,
-            repeats=options.repeats,
-            time_limit=options.time_limit,
-            memory_limit=options.memory_limit,
-            options=changed,
-            fresh=options.fresh,
-            dask=options.dask,
-            progress=progress,
-            registries=registries,
-        )
-    if not options.json and not options.quiet:
+    measured = mb.run(
+        **arguments,
+        options=parse_options(option),
+        progress=Warnings(sys.stderr) if quiet else True,
+        registries=registries,
+    )
+    if not json and not quiet:
         print(measured)
-    pages: list[Path] = []
-    statements: tuple[str, ...] = ()
+    written = mb.Report(files=())
     if measured.records:
-        with report_full_disk(measured.folder):
-            written = report(measured.folder, registries=registries)
-        pages = [file for file in written.files if file.suffix == ".html"]
-        statements = written.said
-    failed = len(measured.refuted) + len(measured.failed) if options.strict else 0
-    if options.json:
-        print(json.dumps({**measured.to_dict(), "pages": [*map(str, pages)]}))
+        written = mb.report(measured.folder, registries=registries)
+    pages = [file for file in written.files if file.suffix == ".html"]
+    failed = _strict_failure(measured) if strict else ""
+    if json:
+        print(dumps({**measured.to_dict(), "pages": [*map(str, pages)]}))
     else:
-        summary = measured.shortfall if options.quiet else [*statements, *pages]
-        for line in [*summary, *[_strict_failure(measured)] * bool(failed)]:
+        lines = measured.shortfall if quiet else [*written.said, *pages]
+        for line in [*lines, *[failed] * bool(failed)]:
             print(line)
     return 1 if measured.shortfall or failed else 0
 
 
-def _strict_failure(results: Results) -> str:
-    """Return the reason why a strict run fails, in one line."""
+def _strict_failure(measured: mb.Results) -> str:
+    """Return the reason why a strict run fails, in one line; "" if it does not fail."""
     counts = (
-        (results.refuted, "refuted claim", "refuted claims"),
+        (measured.refuted, "refuted claim", "refuted claims"),
         (
-            results.failed,
+            measured.failed,
             "measurement without an answer",
             "measurements without an answer",
         ),
@@ -83,4 +72,4 @@ def _strict_failure(results: Results) -> str:
         for records, one, several in counts
         if records
     ]
-    return f"strict: {' and '.join(texts)}"
+    return f"strict: {' and '.join(texts)}" if texts else ""

@@ -3,55 +3,60 @@
 from __future__ import annotations
 
 import fnmatch
-import json
-from argparse import Namespace
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from json import dumps
+from typing import Annotated, Any
 
-from mortarbench.harness import checked
-from mortarbench.harness.errors import say
-from mortarbench.harness.registry import SolverSpec, check_name, resolve
+import mortarbench as mb
+from mortarbench.harness.errors import InputError, say
+from mortarbench.harness.registry import check_name
+from mortarbench.progress import waiting
 from mortarbench.registries import Registries
 
 
-def run(registries: Registries, options: Namespace) -> int:
-    """Run all checks; return 1 if a check fails or a solver solves no QP."""
-    checked.positive("--time-limit", options.time_limit)
-    registries = registries.with_files(options.plugin)
-    specs = [
-        SolverSpec(name=name, label=name)
-        for pattern in options.solver
-        for name in _named(pattern, registries.solvers)
-    ]
-    for spec in specs:
-        check_name(spec.name, registries.solvers)
+def test_solver(
+    registries: Registries,
+    solvers: Annotated[Sequence[str], "NAME"],
+    *,
+    markdown: bool = False,  # noqa: PT028  # not a test
+    json: bool = False,  # noqa: PT028
+    **arguments: Any,
+) -> int:
+    """Run the conformance suite on solvers: QPs with known solutions.
+
+    Exit code 1: a check fails, or a solver solves no QP.
+
+    solvers : a solver, or a pattern such as 'p*'
+    markdown : print only how answers change under equivalent formulations, as a page
+    json : print JSON
+    """
+    if markdown and json:
+        raise InputError("--json: not allowed with --markdown; expected one of them")
+    names = [n for pattern in solvers for n in _named(pattern, registries.solvers)]
+    for name in names:
+        check_name(name, registries.solvers)
     from mortarbench.harness.conformance.conformance import CHECKS, INVARIANCE_PREFIX
     from mortarbench.harness.conformance.weaknesses import weaknesses_page
-    from mortarbench.progress import waiting
-    from mortarbench.validation import test_solver
 
-    for spec in specs:
-        resolve(spec, registries.solvers)
-    checks = [
-        c for c in CHECKS if c.startswith(INVARIANCE_PREFIX) or not options.markdown
-    ]
+    changes = [c for c in CHECKS if c.startswith(INVARIANCE_PREFIX)]
     results = []
-    for spec in specs:
+    for name in names:
         with waiting() as progress:
-            result = test_solver(
-                spec.name,
-                checks=checks,
-                time_limit=options.time_limit,
+            result = mb.test_solver(
+                name,
+                checks=changes if markdown else None,
                 progress=progress,
                 registries=registries,
+                **arguments,
             )
         results.append(result)
-        if not options.json and not options.markdown:
+        if not json and not markdown:
             print(result)
-    if options.markdown:
+    if markdown:
         print(weaknesses_page({one.solver: one.results for one in results}), end="")
         return 0
-    if options.json:
-        print(json.dumps([row for one in results for row in one.to_dict()["checks"]]))
+    if json:
+        print(dumps([row for one in results for row in one.to_dict()["checks"]]))
     for one in results:
         if one.objection:
             say(f"{one.solver} does not conform: it {one.objection}")

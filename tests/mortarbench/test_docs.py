@@ -9,9 +9,8 @@ import yaml
 
 from mortarbench.answer import solve
 from mortarbench.case import build
-from mortarbench.cli.list_ import solvers_page, solvers_pages
-from mortarbench.cli.main import _parser as command_line_parser
-from mortarbench.cli.main import main
+from mortarbench.cli.list import solvers_page, solvers_pages
+from mortarbench.cli.main import command_parser, main
 from mortarbench.harness import (
     InputError,
     Residuals,
@@ -215,7 +214,7 @@ def test_the_workflow_for_ci_calls_existing_commands():
 
     assert [words[0] for words in commands] == ["test-solver", "run", "run", "report"]
     for words in commands:
-        assert command_line_parser().parse_known_args(words)[1] == []
+        assert command_parser(words).parse_known_args(words)[1] == []
 
 
 @pytest.mark.slow

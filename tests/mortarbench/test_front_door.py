@@ -342,8 +342,9 @@ def test_in_a_notebook_a_run_shows_a_bar_and_unverified_answers(monkeypatch, res
     shell = SimpleNamespace(config={"IPKernelApp": {}})
     ipython = SimpleNamespace(get_ipython=lambda: shell)
     monkeypatch.setitem(sys.modules, "IPython", ipython)
+    html = type("HTML", (str,), {"_repr_html_": lambda text: text})
     monkeypatch.setitem(
-        sys.modules, "IPython.display", SimpleNamespace(display=display)
+        sys.modules, "IPython.display", SimpleNamespace(display=display, HTML=html)
     )
     good = results.records[0]
     bad = good.replace(status=Verdict.WRONG, solver="<osqp>")

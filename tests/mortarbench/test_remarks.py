@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from mortarbench.answer import remarks
 from mortarbench.cli.main import main
 from mortarbench.harness import Verdict
 from mortarbench.registries import Registries
+from mortarbench.verification import remarks
 from tests.support.gmsh_files import BLOCKS, stacked_blocks
 
 pytestmark = pytest.mark.together

@@ -293,7 +293,7 @@ def test_commands_state_their_activity_and_refuse_an_impossible_limit(
 
     for words in (
         ("test-solver", "exact"),
-        ("solve", "toy/plain", "--solver", "exact"),
+        ("solve", "well/primal", "--solver", "exact"),
     ):
         code, _, err = cli(*words, "--time-limit", "-1")
         assert code == 2

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import ast
 import inspect
-import json
-from argparse import Namespace
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from functools import cache
+from json import dumps
 from textwrap import dedent
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from mortarbench import listing
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.registry import options_of
-from mortarbench.registries import Registries
+from mortarbench.registries import Plugins, Registries
 
 if TYPE_CHECKING:
     from mortarbench.harness.plugin import Solver
@@ -65,11 +64,23 @@ interfaces `qpsolvers:NAME` and `cvxpy:NAME`.
 """
 
 
-def run(registries: Registries, options: Namespace) -> int:
-    """Print problems, solvers or suites, one line each or as one JSON array."""
-    registries = registries.with_files(options.plugin)
-    if options.markdown:
-        if options.what != "solvers":
+def list_(
+    registries: Registries,
+    what: Literal["problems", "solvers", "suites"],
+    *,
+    plugins: Plugins = (),
+    markdown: bool = False,
+    json: bool = False,
+) -> int:
+    """List the available problems, solvers or suites.
+
+    what : what to list
+    plugins : Python files with more solvers or families
+    markdown : solvers: print the notes on all solvers as Markdown
+    json : print JSON
+    """
+    if markdown:
+        if what != "solvers":
             raise InputError("--markdown applies only to `list solvers`")
         print(solvers_page(registries.solvers), end="")
         return 0
@@ -78,8 +89,8 @@ def run(registries: Registries, options: Namespace) -> int:
         "solvers": listing.solvers,
         "suites": listing.suites,
     }
-    rows = functions[options.what](registries=registries)
-    print(json.dumps(list(rows)) if options.json else rows)
+    rows = functions[what](registries=registries)
+    print(dumps(list(rows)) if json else rows)
     return 0
 
 
