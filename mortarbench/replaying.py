@@ -123,11 +123,11 @@ def replay(
     """
     registries = load_registries(plugins, registries)
     path, solvers = checked.path("folder", folder), registries.solvers
-    families = registries.families_with_copies(path)
+    families = registries.families
     stored = open_stored_run(path, text("run_id", run_id), families, solvers)
     environment = registries.environment()
     unit = work_unit_of(stored, solvers, digest(environment))
-    commands = registries.commands([stored.spec], path)
+    commands = registries.commands([stored.spec])
     with (
         TemporaryDirectory(prefix="mortarbench-") as scratch,
         local_engine(

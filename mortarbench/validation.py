@@ -99,8 +99,8 @@ def validate(
     if not checked.is_number(budget) or not budget >= 0:  # `not ≥` also rejects NaN
         raise InputError(f"budget = {shown(budget)}; expected a number of seconds ≥ 0")
     registries = load_registries(plugins, registries)
-    families = registries.families_with_copies(path)
-    result = validate_folder(path, families, registries.reference, progress, budget)
+    families, reference = registries.families, registries.reference
+    result = validate_folder(path, families, reference, progress, budget)
     data = as_data(result, path.resolve().name)
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
