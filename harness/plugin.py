@@ -9,8 +9,6 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
     from mortarbench.harness.distributed.comm import Comm
@@ -269,17 +267,6 @@ class CaseOnRanks(NamedTuple):
     case: Callable[[], Case]
 
 
-@dataclass(frozen=True, kw_only=True)
-class SourceFile:
-    """A file from which a case is read, identified by its content."""
-
-    path: str  #: path as given in the name of the case
-    sha256: str  #: first 12 hexadecimal digits of the SHA-256 of the content
-    #: suffix for the name of a copy; the suffix depends on the file format, not on
-    #: `path`
-    suffix: str
-
-
 class Family(ABC):
     """A parametrised family of problems, usually a frozen dataclass.
 
@@ -336,27 +323,9 @@ class Family(ABC):
         """
         return ""
 
-    def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
-        """Return the file from which a case is read, or None for other cases.
-
-        The file is copied to the result folder.
-        """
-        return None
-
     def problems_in(self, path: str) -> list[str]:
         """Return the paths of the problems in an input file, such as PATH#1, PATH#2."""
         return [path]
-
-    def with_copies(self, folder: Path) -> Family:
-        """Return a family that also reads the copies of files in a result folder.
-
-        A copy is read if the original file is missing or has different content.
-        """
-        return self
-
-    def copied_paths(self) -> list[str]:
-        """Return the paths of the copied files, see `with_copies`."""
-        return []
 
     def subdomains(self, form: str, params: Mapping[str, Value]) -> int:
         """Return the largest number of ranks that can build the case together.

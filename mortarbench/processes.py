@@ -29,9 +29,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     request = json.loads(text)
     stand_for_harness()
     registries = registries.with_files(request["plugins"])
-    families, solver = registries.families, None
-    if "folder" in request:
-        families = registries.families_with_copies(Path(request["folder"]))
+    solver = None
     if "name" in request:
         name, solvers = request["name"], registries.solvers
         if "copy" in request:
@@ -50,7 +48,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
 
     work = Worker(
         solver=solver,
-        cases=Cases(families, registries.reference),
+        cases=Cases(registries.families, registries.reference),
         operators=registries.operators,
     )
     is_parallel = request.get("ranks", 1) > 1

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeAlias
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.limits import ONE_THREAD
-from mortarbench.harness.plugin import Family, Reference, Solver, as_family
+from mortarbench.harness.plugin import Family, Reference, Solver
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.registry import (
     Plugin,
@@ -153,27 +153,6 @@ def _validation_page(folder: Path, data: Mapping[str, Any]) -> list[Path]:
     return write_validation(folder, data)
 
 
-class _FamiliesWithCopies(Mapping[str, Family]):
-    """Families that read missing input files from the copies in a result folder."""
-
-    def __init__(self, families: Mapping[str, Family], folder: Path | None) -> None:
-        self._families = families
-        self._folder = folder
-
-    def __getitem__(self, name: str) -> Family:
-        family = as_family(self._families[name])
-        return family if self._folder is None else family.with_copies(self._folder)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._families
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._families)
-
-    def __len__(self) -> int:
-        return len(self._families)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Registries:
     """Families, solvers and operators, and the commands that start processes."""
@@ -286,26 +265,11 @@ class Registries:
                 "strings, true or false, or lists and dicts of these"
             ) from None
 
-    def families_with_copies(self, folder: Path | None) -> Mapping[str, Family]:
-        """Return families that read missing input files from a result folder.
-
-        folder : result folder with copies, checked by `refuse_links`; None if there are
-            no copies
-        """
-        return _FamiliesWithCopies(self.families, folder)
-
-    def commands(
-        self, specs: Iterable[SolverSpec], folder: Path | None = None
-    ) -> Commands:
-        """Return the commands that start the processes of a run.
-
-        folder : result folder with copies of input files, from which cases may be built
-        """
+    def commands(self, specs: Iterable[SolverSpec]) -> Commands:
+        """Return the commands that start the processes of a run."""
         from mortarbench.harness.results.work_unit import Commands
 
-        request: dict[str, Any] = {"plugins": self._absolute_files()}
-        if folder is not None:
-            request["folder"] = str(folder.absolute())
+        request = {"plugins": self._absolute_files()}
         return Commands(
             solvers={s.label: self.worker_command(s) for s in specs},
             case_worker=[*self.start, "worker", json.dumps(request)],

@@ -117,11 +117,10 @@ def replay(
     from mortarbench.harness.results.work_unit import BuildFailure, MeasurementFault
     from mortarbench.harness.running.executor import local_engine
 
-    families = registries.families_with_copies(path)
-    stored = open_stored_run(path, run_id, families, solvers)
+    stored = open_stored_run(path, run_id, registries.families, solvers)
     environment = registries.environment()
     unit = work_unit_of(stored, solvers, digest(environment))
-    commands = registries.commands([stored.spec], path)
+    commands = registries.commands([stored.spec])
     with (
         TemporaryDirectory(prefix="mortarbench-") as scratch,
         local_engine(

@@ -358,9 +358,8 @@ def run(
         folder = folder or Path("out") / suite_file(toml(text)).name
     fresh = checked.flag("fresh", fresh)
     if folder.is_dir():
-        # Check for links before copies are read: a link could point outside the folder.
         refuse_links(folder)
-    families = registries.families_with_copies(None if fresh else folder)
+    families = registries.families
     asked = with_overrides(
         parse_suite(text, f"{path}", path.parent, families, registries.solvers),
         families,
@@ -403,7 +402,7 @@ def run(
         missing = run_suite(
             asked,
             out=folder,
-            commands=registries.commands(asked.solvers, folder),
+            commands=registries.commands(asked.solvers),
             resolve=lambda spec: resolve(spec, registries.solvers),
             environment=environment,
             digest=digest(environment),

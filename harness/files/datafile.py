@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.errors import InputError, shortened
 from mortarbench.harness.files import reading
 
@@ -132,6 +133,24 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             raise InputError(
                 f"{path}: not a gzip file, or damaged; expected {expected}, compressed"
             ) from None
+
+
+def content_digest(*paths: Path) -> str:
+    """Return 12 hexadecimal digits of the SHA-256 of the concatenated files.
+
+    Raises
+    ------
+    InputError
+        For the same reasons as in `opened`.
+
+    """
+
+    def parts() -> Iterator[bytes]:
+        for path in paths:
+            with opened(path, "a readable file") as file:
+                yield from pieces(file)
+
+    return hex_digest(parts(), 12)
 
 
 @contextmanager

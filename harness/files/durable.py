@@ -20,11 +20,6 @@ from mortarbench.harness.errors import InputError
 
 #: pattern of the names of files that are not yet complete
 _UNFINISHED = ".mortarbench-*.tmp"
-#: patterns of the names of incomplete files of older versions, and of incomplete files
-#: in case folders
-_OTHERS = ("*.tmp", "*.new", ".*.new")
-#: names of incomplete files in result folders of older versions
-_OLD = ("suite.tmp", "environment.tmp")
 
 #: error numbers of a full disk, an exhausted quota and an exceeded file size limit
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -70,21 +65,16 @@ def _sync(file: IO[bytes]) -> None:
     os.fsync(file.fileno())
 
 
-def remove_unfinished(
-    folder: Path, own: Iterable[Path], shared: Iterable[Path] = ()
-) -> None:
+def remove_unfinished(folder: Path, own: Iterable[Path]) -> None:
     """Delete incomplete files that killed processes left in a result folder.
 
     No process may be writing to the folder.
 
     own : subfolders that contain only files of this package
-    shared : subfolders that may also contain files of the user
     """
-    unfinished = [*folder.glob(_UNFINISHED), *(folder / name for name in _OLD)]
-    unfinished += [path for one in shared for path in one.glob(_UNFINISHED)]
-    for one in own:
-        unfinished += [*one.rglob(_UNFINISHED)]
-        unfinished += [path for pattern in _OTHERS for path in one.glob(pattern)]
+    unfinished = [*folder.glob(_UNFINISHED)]
+    for pattern in (_UNFINISHED, "*.new"):  # the second is that of case folders
+        unfinished += [path for one in own for path in one.rglob(pattern)]
     for path in unfinished:
         path.unlink(missing_ok=True)
 

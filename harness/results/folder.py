@@ -15,8 +15,6 @@ from typing import Any
 from mortarbench.harness.environment.environment import VOLATILE
 from mortarbench.harness.environment.labels import in_words
 from mortarbench.harness.errors import InputError, shortened, some
-from mortarbench.harness.files.copies import FOLDER as COPIES
-from mortarbench.harness.files.copies import is_copy, remove_copies
 from mortarbench.harness.files.durable import (
     remove_unfinished,
     replace_file,
@@ -32,7 +30,7 @@ from mortarbench.harness.suite.growth import incompatibility
 from mortarbench.harness.suite.suite import Suite, SuiteFile, read_stored, suite_file
 
 #: Folders and files that commands write to a result folder. ``--fresh`` deletes or
-#: overwrites only these, those in `_RESULT_FILES`, and copies of input files.
+#: overwrites only these and those in `_RESULT_FILES`.
 _FOLDERS = ("journal", "vectors", "cases", "environments", "report")
 _FILES = ("environment.json", "suite.toml")
 #: results of `mortarbench validate`, and faults of runs
@@ -78,8 +76,6 @@ def refuse_links(folder: Path) -> None:
                         raise _not_plain(entry.path, "a folder")
                     if entry.is_dir(follow_symlinks=False):
                         _only_plain(entry.path)
-                elif entry.name == COPIES:
-                    _only_plain_copies(entry)
                 elif entry.name.startswith(_FILE_PREFIXES) and not _is_plain(entry):
                     raise _not_plain(entry.path, "a regular file")
     except OSError as e:
@@ -106,24 +102,6 @@ def _only_plain(folder: str) -> None:
             f"{folder}: folders nested deeper than {MAX_FOLDER_DEPTH} levels; "
             "expected at most this depth; move the deeper folders away"
         )
-
-
-def _only_plain_copies(folder: os.DirEntry[str]) -> None:
-    """Raise `InputError` for links, pipes and devices among copies of input files.
-
-    Other entries are ignored, since a user may have a folder of the same name.
-    """
-    if folder.is_symlink():
-        raise _not_plain(folder.path, "a folder")
-    if not folder.is_dir():
-        return
-    with os.scandir(folder.path) as entries:
-        for entry in entries:
-            if is_copy(entry.name) and not entry.is_file(follow_symlinks=False):
-                raise InputError(
-                    f"{entry.path} is not a regular file; expected a regular file, "
-                    "since copies of input files have such names"
-                )
 
 
 def _is_plain(entry: os.DirEntry[str]) -> bool:
@@ -245,7 +223,7 @@ def lock_folder(folder: Path) -> Iterator[FolderLock]:
         # Unfinished files are deleted after locking, since another run may still have
         # been writing them.
         folders = [folder / name for name in _FOLDERS]
-        remove_unfinished(folder, folders, shared=[folder / COPIES])
+        remove_unfinished(folder, folders)
         yield lock
     finally:
         lock.close()
@@ -317,7 +295,6 @@ def claim(
             shutil.rmtree(out / name, ignore_errors=True)
         for name in _RESULT_FILES:
             (out / name).unlink(missing_ok=True)
-        remove_copies(out)
     describe(out, suite, environment)
 
 

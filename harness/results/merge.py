@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness.errors import InputError, shown
-from mortarbench.harness.files.copies import check_copies, merge_copies
 from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.files.store import copy_stored
 from mortarbench.harness.record import Record
@@ -68,8 +67,6 @@ def merge(
     paths = {str(folder): folder / "suite.toml" for folder in folders}
     suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
     suite = as_toml(unite(suites))
-    for folder in folders:
-        check_copies(folder)
     with report_full_disk(out), lock_folder(out):
         merged: dict[str, Record] = {}
         for folder in existing:
@@ -82,7 +79,6 @@ def merge(
                 )
         for source, records in journals.items():
             _copy_solutions(source, out, records, tell)
-        merge_copies(list(journals), out, tell)
         _copy_environments(folders, out, merged.values(), tell)
         faults = [f.to_json() for folder in folders for f in read_faults(folder)]
         if faults:

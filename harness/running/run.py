@@ -16,7 +16,6 @@ from secrets import token_hex
 from typing import Any
 
 from mortarbench.harness.errors import InputError, shown
-from mortarbench.harness.files.copies import keep_copies, refuse_own_copies
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.files.lines import Lines
 from mortarbench.harness.files.store import save
@@ -111,11 +110,7 @@ def run(
             _check_same(out, past, suite, options)
             if has_grown:
                 _check_steps(out, past, suite)
-        sources = [s for c in suite.names if (s := c.family.source_file(c.params))]
-        if fresh:  # before `claim`, which deletes the copies
-            refuse_own_copies(out, sources)
         claim(out, suite, environment, fresh=fresh)
-        keep_copies(out, sources, progress.warn)
         with (
             scratch_in(out) as scratch,
             Journal(out, digest, progress.warn) as journal,

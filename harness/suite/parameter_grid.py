@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from glob import escape, glob
 from itertools import product
 from math import prod
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import Meta, Struct
@@ -181,19 +181,18 @@ def _expanded(paths: object, folder: Path, family: Family) -> object:
     expanded: list[object] = []
     for path in paths if isinstance(paths, list) else [paths]:
         if isinstance(path, str) and path:
-            for file in _files(path, folder, family):
+            for file in _files(path, folder):
                 expanded += family.problems_in(file)
         else:
             expanded.append(path)
     return expanded if len(expanded) != 1 or isinstance(paths, list) else expanded[0]
 
 
-def _files(path: str, folder: Path, family: Family) -> list[str]:
+def _files(path: str, folder: Path) -> list[str]:
     """Return the files that a path or a shell pattern denotes, sorted by name.
 
     Files are searched relative to the working directory, then relative to the folder of
-    the suite, then among the files copied to the result folder, which a path or pattern
-    denotes if it matches the last components of their paths.
+    the suite.
     """
     file, _ = split_row(path)
     row = path.removeprefix(file)
@@ -201,13 +200,9 @@ def _files(path: str, folder: Path, family: Family) -> list[str]:
         return [path]
     if (beside := folder / file).is_file():
         return [f"{os.path.relpath(beside)}{row}"]
-    copied = _copied(escape(file), family)
-    if file not in copied and len(copied) == 1:
-        return [f"{copied[0]}{row}"]
-    if copied or not set("*?[") & set(path):
+    if not set("*?[") & set(path):
         return [path]
-    missing = {p for p in _copied(path, family) if not os.path.lexists(p)}
-    if here := sorted({*filter(os.path.isfile, glob(path)), *missing}):
+    if here := sorted(filter(os.path.isfile, glob(path))):
         return here
     there = glob(os.path.join(escape(str(folder)), path))
     if files := sorted(map(os.path.relpath, filter(os.path.isfile, there))):
@@ -216,10 +211,3 @@ def _files(path: str, folder: Path, family: Family) -> list[str]:
         f"params.path = {shown(path)} matches no file; expected a pattern relative "
         "to the working directory or to the folder of the suite"
     )
-
-
-def _copied(pattern: str, family: Family) -> list[str]:
-    """Return the listed paths of copied files whose last components match a pattern."""
-    if not PurePath(pattern).parts:
-        return []
-    return [path for path in family.copied_paths() if PurePath(path).match(pattern)]

@@ -7,7 +7,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness.errors import unknown
-from mortarbench.harness.plugin import SourceFile
 from mortarbench.problems.families.from_file import FromFile
 from mortarbench.problems.ranges import at_least
 
@@ -38,12 +37,6 @@ class Fclib(FromFile):
             raise unknown("loop", str(params["loop"]), loops, where=self.name)
         at_least(0, self.name, params, ["iterate"])
         super().check(params)
-
-    def source_file(self, params: Mapping[str, Value]) -> SourceFile:
-        """Return the path of the file, the digest of its content, and its suffix."""
-        return SourceFile(
-            path=str(params["path"]), sha256=str(params["sha256"]), suffix=".hdf5"
-        )
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness import InputError
 from mortarbench.harness.checked import located
-from mortarbench.harness.files.copies import content_digest
+from mortarbench.harness.files.datafile import content_digest
 from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.files.file_digest import check_digest
 from mortarbench.problems.ranges import (

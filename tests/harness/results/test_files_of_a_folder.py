@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 from contextlib import contextmanager, nullcontext, suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -207,30 +206,6 @@ def test_faults_of_any_type_are_read_or_refused_by_every_command(
     try_commands(folder_of_run, tmp_path, FAULTS, kind, read_by_every_command)
 
 
-# `test_files_travel.py` tests copies with another content
-@pytest.mark.parametrize("kind", but_slow(empty))
-def test_copies_of_files_are_read_or_refused_if_the_original_is_missing(
-    folder_of_run, tmp_path, kind, read_by_every_command
-):
-    original = folder_of_run.with_name("qp.npz")
-    original.rename(tmp_path / "away.npz")
-    names = [
-        name for name in kinds_of_files(folder_of_run) if name.startswith("files/")
-    ]
-    try:
-        assert len(names) == 2
-        for name in names:
-            try_commands(
-                folder_of_run,
-                tmp_path / Path(name).stem,
-                name,
-                kind,
-                read_by_every_command,
-            )
-    finally:
-        (tmp_path / "away.npz").rename(original)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
@@ -239,7 +214,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
     names = kinds_of_files(folder_of_run)
     assert {name.partition("/")[0].partition(".")[0] for name in names} >= {
         "journal", "vectors", "cases", "report", "environments",
-        "environment", "suite", "faults", "validation", "", "files",
+        "environment", "suite", "faults", "validation", "",
     }  # fmt: skip
     for i, name in enumerate(names):
         try_commands(

@@ -887,8 +887,7 @@ def test_unfinished_files_of_a_killed_run_are_removed_by_the_next(measure, tmp_p
     stale = [
         tmp_path / name
         for name in (
-            ".mortarbench-0.tmp", "suite.tmp", "vectors/tmp0.tmp", "cases/0.new",
-            "report/.mortarbench-0.tmp",
+            ".mortarbench-0.tmp", "cases/0.new", "report/.mortarbench-0.tmp",
         )
     ]  # fmt: skip
     (tmp_path / "report").mkdir()
