@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from mortarbench.arguments import PICTURES, check_output_file
 from mortarbench.harness import checked
 from mortarbench.harness.checked import located
-from mortarbench.harness.environment.doctor import load_advice
+from mortarbench.harness.environment.doctor import is_busy
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.errors import shown as given
@@ -372,7 +372,7 @@ def run(
     )
     environment = registries.environment()
     with shown(progress) as display, ExitStack() as stack:
-        if load_advice(busy := os.getloadavg()[0]):
+        if is_busy(busy := os.getloadavg()[0]):
             display.warn(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
                 "be less precise"

@@ -12,14 +12,15 @@ def run(registries: Registries, options: Namespace) -> int:
     """Describe this machine, and recommend changes for better measurements."""
     from rich.console import Console
 
-    from mortarbench.harness.environment.doctor import as_json, examine, render
+    from mortarbench.harness.environment.doctor import advice, render
     from mortarbench.harness.environment.environment import digest
 
     environment = registries.environment()
-    checks = examine(environment)
     if options.json:
-        print(json.dumps(as_json(environment, checks)))
+        changes = advice(environment)
+        data = {"digest": digest(environment), "fit": not changes, "advice": changes}
+        print(json.dumps(data | {"environment": environment}))
     else:
-        text = render(checks, digest(environment))
+        text = render(environment, digest(environment))
         Console(highlight=False, soft_wrap=True).print(text)
     return 0
