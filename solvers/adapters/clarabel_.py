@@ -74,7 +74,7 @@ class Clarabel(SequenceAdapter):
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         return chain(partial(self._begin, presolve=False), tol)
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         import clarabel
 
         return clarabel.DefaultSettings()

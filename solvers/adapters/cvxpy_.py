@@ -136,9 +136,9 @@ class CVXPY(Adapter):
             return "needs a row or a bound"
         return DECLINED_BACKENDS.get(self.backend) or needs_matrices(qp)
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         direct: Any = SOLVERS.get(self.backend.lower())
-        return direct._library() if isinstance(direct, Adapter) else None
+        return direct.library() if isinstance(direct, Adapter) else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import cvxpy

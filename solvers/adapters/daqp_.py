@@ -83,7 +83,7 @@ class DAQP(SequenceAdapter):
     def declines(self, qp: QP) -> str | None:
         return needs_dense(qp, 3)
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         import daqp
 
         return daqp.Model().settings

@@ -105,7 +105,7 @@ class HiGHS(Adapter):
             return "not installed: highspy_extras (pip install highspy-extras)"
         return needs_matrices(qp)
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         import highspy
 
         return highspy.Highs().getOptions()

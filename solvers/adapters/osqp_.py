@@ -71,7 +71,7 @@ class OSQP(SequenceAdapter):
         ),
     )
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         import osqp
 
         ext = osqp.OSQP(algebra="builtin").ext

@@ -65,7 +65,7 @@ class PIQP(SequenceAdapter):
         as_dense = resolve_backend(self.backend, qp) == "dense"
         return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         import piqp
 
         return piqp.SparseSolver().settings

@@ -96,7 +96,7 @@ class ProxQP(SequenceAdapter):
         as_dense = resolve_backend(self.backend, qp) == "dense"
         return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         from proxsuite import proxqp
 
         return proxqp.Settings()

@@ -60,7 +60,7 @@ class QOCO(SequenceAdapter):
         ),
     )
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         import qoco
 
         ext = qoco.QOCO().ext

@@ -65,7 +65,7 @@ class QPALM(SequenceAdapter):
         ),
     )
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         import qpalm
 
         return qpalm.Settings()

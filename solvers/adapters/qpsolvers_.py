@@ -155,9 +155,9 @@ class QPSolvers(Adapter):
         dense_only = self.backend in DENSE_BACKENDS
         return needs_dense(qp, 4) if dense_only else needs_matrices(qp)
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         direct: Any = SOLVERS.get(self.backend)
-        return direct._library() if isinstance(direct, Adapter) else None
+        return direct.library() if isinstance(direct, Adapter) else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         if self.backend not in NEEDS_FIXED_IN_ROWS:

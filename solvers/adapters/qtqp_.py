@@ -87,7 +87,7 @@ class QTQP(SequenceAdapter):
             return "needs an inequality row or a bound"
         return needs_matrices(qp)
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         import qtqp
 
         parameters = signature(qtqp.QTQP.solve).parameters

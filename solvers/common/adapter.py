@@ -40,7 +40,7 @@ class Adapter:
         """
         library: Any = None
         with suppress(ImportError):
-            library = self._library()
+            library = self.library()
         if library is not None and not isinstance(library, Mapping):
             names = [name for name in dir(library) if not name.startswith("_")]
             library = {name: getattr(library, name) for name in names}
@@ -50,7 +50,7 @@ class Adapter:
             if isinstance(value, int | float | str) or hasattr(value, "name")
         }
 
-    def _library(self) -> Any:
+    def library(self) -> Any:
         """Return the settings of the library: an object, a mapping, or None."""
         return None
 
@@ -74,17 +74,17 @@ class Adapter:
         """
         library: Any = None
         with suppress(ImportError):
-            library = self._library() if self.settings else None
+            library = self.library() if self.settings else None
         settings = dict(self.settings)
         for name, value in settings.items() if library is not None else ():
-            is_map = isinstance(library, Mapping)
-            default = library[name] if is_map else getattr(library, name)
+            is_map, default = isinstance(library, Mapping), None
             try:
+                default = library[name] if is_map else getattr(library, name)
                 if isinstance(value, str) and not isinstance(default, str):
                     settings[name] = getattr(type(default), value)
                 if not is_map:
                     setattr(library, name, settings[name])
-            except (AttributeError, TypeError, ValueError, OverflowError) as e:
+            except (LookupError, AttributeError, TypeError, OverflowError) as e:
                 names = getattr(type(default), "__members__", ())
                 expected = f"; expected one of {', '.join(names)}" if names else ""
                 raise ValueError(f"{name} = {value!r}: {e}{expected}") from None

@@ -11,6 +11,7 @@ from mortarbench.harness.registry import SolverSpec, options_of, resolve
 from mortarbench.harness.suite.solver_options import parse_options, sweep
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.adapters.daqp_ import DAQP
 from mortarbench.solvers.common.adapter import Adapter
 
 DIRECT = (
@@ -101,6 +102,12 @@ def test_what_the_library_refuses_is_refused_in_one_line(name, options, message)
     assert str(e.value).startswith(f"{name}: ")
 
 
+@pytest.mark.parametrize("kind", [Clarabel, DAQP])
+def test_an_object_with_an_unknown_setting_is_refused(kind):
+    with pytest.raises(ValueError, match="nonsense = 1: "):
+        kind(settings={"nonsense": 1})
+
+
 def test_the_command_line_converts_to_the_type_of_the_default():
     specs = [SolverSpec(name=n, label=n) for n in ("clarabel", "qpsolvers:quadprog")]
     given = ["clarabel.max_step_fraction=1", "max_iter=50", "verbose=true"]
@@ -124,5 +131,5 @@ def test_without_the_library_settings_are_checked_by_nobody(monkeypatch):
     def missing(self):
         raise ImportError
 
-    monkeypatch.setattr(Clarabel, "_library", missing)
+    monkeypatch.setattr(Clarabel, "library", missing)
     assert replace(Clarabel(), settings={"any": 1}).library_settings() is None
