@@ -45,6 +45,11 @@ class Solver(Protocol):
     bounds, as with ``(Box,)``. QPs with other sets are declined without a call of
     `declines`.
 
+    A solver that passes settings to a library may have a field ``settings``, a mapping,
+    and a method ``library_settings()`` that returns the defaults of all settings by
+    name, or None if the library does not list them. These settings are then options of
+    the solver, see `solvers.common.adapter`.
+
     Examples
     --------
     A solver for QPs without constraints other than equations:

@@ -224,8 +224,8 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
     prefix, colon, backend = spec.name.rpartition(":")
     wildcard = f"{prefix}:*"
     if colon and wildcard in solvers and (backend == "*" or spec.name not in solvers):
-        solver = _with_options(spec, solvers[wildcard], reserved={"backend"})
-        return _with_backend(prefix, backend, solver)
+        solver = _with_backend(prefix, backend, solvers[wildcard])
+        return _with_options(spec, solver, reserved={"backend"})
     check_name(spec.name, solvers)
     return _with_options(spec, solvers[spec.name])
 
@@ -245,10 +245,36 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
-    """Return the values of a solver's options by name; {} if it is not a dataclass."""
+    """Return the values of a solver's options by name; {} if it is not a dataclass.
+
+    The field `settings` of a solver with `library_settings` is a mapping; its items are
+    options as well.
+    """
     if not is_dataclass(solver):
         return {}
-    return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
+    options = {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
+    return options | (options.pop("settings") if is_adapter(solver) else {})
+
+
+def known_options(solver: Any, key: str = "") -> dict[str, Any]:
+    """Return `options_of` and, with their defaults, the settings of the library.
+
+    key : if a field of the solver has this name, the library is not imported, and its
+        settings are omitted
+    """
+    own = options_of(solver)
+    listed = is_adapter(solver) and key not in own and solver.library_settings()
+    return {**(listed or {}), **own}
+
+
+def accepts_any(solver: Any) -> bool:
+    """Return True if the library behind a solver does not list its settings."""
+    return is_adapter(solver) and solver.library_settings() is None
+
+
+def is_adapter(solver: object) -> bool:
+    """Return True if a solver passes settings to a library, see `Solver`."""
+    return hasattr(solver, "library_settings")
 
 
 def option_types(solver: Solver) -> dict[str, Any]:
@@ -384,16 +410,22 @@ def _with_backend(prefix: str, backend: str, solver: Any) -> Solver:
 def _with_options(
     spec: SolverSpec, solver: Any, *, reserved: set[str] | None = None
 ) -> Solver:
-    known = options_of(solver)
-    for name in reserved or ():
-        known.pop(name, None)
     annotated = option_types(solver)
-    changes = {}
+    changes: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for name, value in spec.options.items():
-        if name not in known:
+        known = known_options(solver, name)
+        for other in reserved or ():
+            known.pop(other, None)
+        if name in known:
+            where, kind = f"{spec.name}: {name}", annotated.get(name)
+            value = _option(where, value, known[name], kind)
+        elif name in (reserved or ()) or not accepts_any(solver):
             raise unknown("option", name, known, where=spec.name)
-        where, kind = f"{spec.name}: {name}", annotated.get(name)
-        changes[name] = _option(where, value, known[name], kind)
+        own = any(f.name == name for f in fields(solver))
+        (changes if own else settings)[name] = value
+    if settings:
+        changes["settings"] = {**solver.settings, **settings}
     if not changes:
         # without options, the solver need not be a dataclass
         return solver  # type: ignore[no-any-return]

@@ -371,14 +371,14 @@ def run(
         memory_limit=memory_limit,
         options=listed_options({} if options is None else options),
     )
-    from mortarbench.harness.environment.doctor import load_advice
+    from mortarbench.harness.environment.doctor import is_busy
     from mortarbench.harness.environment.environment import digest
     from mortarbench.harness.running.executor import local_engine
     from mortarbench.harness.running.run import run as run_suite
 
     environment = registries.environment()
     with shown(progress) as display, ExitStack() as stack:
-        if load_advice(busy := os.getloadavg()[0]):
+        if is_busy(busy := os.getloadavg()[0]):
             display.warn(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
                 "be less precise"

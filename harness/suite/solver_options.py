@@ -22,7 +22,13 @@ import msgspec
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.plugin import Solver
-from mortarbench.harness.registry import SolverSpec, option_types, options_of, resolve
+from mortarbench.harness.registry import (
+    SolverSpec,
+    accepts_any,
+    known_options,
+    option_types,
+    resolve,
+)
 
 #: End of the label of the second copy of a solver in an A/A comparison (``null_arm``).
 NULL_SUFFIX = " (A/A)"
@@ -149,11 +155,16 @@ def sweep(
     variants: dict[str, SolverSpec] = {}  # by label
     with located("--option"):
         for spec in specs:
-            known = options_of(resolve(spec, registry))
+            configured = resolve(spec, registry)
             axes = {}
             for full, values in given.items():
                 solver, _, key = full.rpartition(".")
-                if solver in ("", spec.label, spec.name) and key in known:
+                is_meant = solver in (spec.label, spec.name) or len(specs) == 1
+                # a library without a list of its settings has every option
+                if solver in ("", spec.label, spec.name) and (
+                    key in known_options(configured, key)
+                    or (is_meant and accepts_any(configured))
+                ):
                     axes[key] = values
                     used.add(full)
             for variant in with_values(spec, axes, registry):
@@ -167,7 +178,7 @@ def sweep(
             chosen = [s for s in specs if solver in ("", s.label, s.name)]
             if not chosen:
                 raise unknown("solver", solver, [s.label for s in specs])
-            names = {k for s in chosen for k in options_of(resolve(s, registry))}
+            names = {k for s in chosen for k in known_options(resolve(s, registry))}
             where = solver or (specs[0].name if len(specs) == 1 else "")
             raise unknown("option", key, names, where=where)
     return tuple(variants.values())
@@ -189,7 +200,7 @@ def grid(spec: SolverSpec, registry: Mapping[str, Solver]) -> Iterator[SolverSpe
         key: value
         for key, value in spec.options.items()
         if isinstance(value, list)
-        and key in options_of(solver)
+        and key in known_options(solver, key)
         and not _is_value(value, _kinds(solver, key))
     }
     fixed = {k: v for k, v in spec.options.items() if k not in axes}
@@ -220,7 +231,7 @@ def with_values(
 
 def _kinds(solver: Solver, key: str) -> tuple[Any, ...]:
     """Return the types of the values of an option; None is one if it is the default."""
-    default = options_of(solver)[key]
+    default = known_options(solver, key).get(key)
     kind = option_types(solver).get(key, type(default))
     if kind is NoneType:
         return _ANY

@@ -14,14 +14,15 @@ def doctor(registries: Registries, *, json: bool = False) -> int:
     """
     from rich.console import Console
 
-    from mortarbench.harness.environment.doctor import as_json, examine, render
+    from mortarbench.harness.environment.doctor import advice, render
     from mortarbench.harness.environment.environment import digest
 
     environment = registries.environment()
-    checks = examine(environment)
     if json:
-        print(dumps(as_json(environment, checks)))
+        changes = advice(environment)
+        data = {"digest": digest(environment), "fit": not changes, "advice": changes}
+        print(dumps(data | {"environment": environment}))
     else:
-        text = render(checks, digest(environment))
+        text = render(environment, digest(environment))
         Console(highlight=False, soft_wrap=True).print(text)
     return 0

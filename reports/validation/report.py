@@ -18,15 +18,13 @@ from mortarbench.reports.document.layout import (
     Column,
     Page,
     Part,
-    Picture,
     Section,
     Table,
 )
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.render.html_page import html
 from mortarbench.reports.render.markdown import markdown
-from mortarbench.reports.render.writing import write_figures, write_text
-from mortarbench.reports.validation.error_figure import error_figure
+from mortarbench.reports.render.writing import write_text
 
 Data = Mapping[str, Any]
 TEXT = Sentences(__name__)
@@ -35,9 +33,8 @@ TEXT = Sentences(__name__)
 def write_validation(directory: Path, data: Data) -> list[Path]:
     """Write report/validation.html and .md from the data of `validate`."""
     page, target = compose(data), directory / "report"
-    _, drawings = write_figures(page, target)
     return [
-        write_text(target / "validation.html", html(page, drawings)),
+        write_text(target / "validation.html", html(page)),
         write_text(target / "validation.md", markdown(page)),
     ]
 
@@ -90,12 +87,6 @@ def _verdict(data: Data) -> Iterator[Part]:
         ),
         notes=(TEXT("last_column"),),
     )
-    answers = data["answers"]
-    tol = min((a["tol"] for a in answers), default=0.0)
-    figure = error_figure(answers, tol)
-    if figure is not None:  # claims without a point have no error
-        caption = TEXT("errors", tol)
-        yield Picture(name="validation-errors", caption=caption, figure=figure)
 
 
 def _column(head: str, name: str = "", show: Callable[[Any], str] = str) -> Column:

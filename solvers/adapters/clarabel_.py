@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.sparse import triu
@@ -20,11 +20,10 @@ from mortarbench.harness import (
     About,
     Solution,
     Status,
-    needs_matrices,
 )
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
-    check_positive,
     csc,
     objective_factor,
     to_cone,
@@ -42,7 +41,7 @@ CLAIMS = {
 
 
 @dataclass(frozen=True)
-class Clarabel:
+class Clarabel(SequenceAdapter):
     """https://clarabel.org, with one thread.
 
     Clarabel divides each residual by max(1, size of its terms). The gap must be below
@@ -72,19 +71,15 @@ class Clarabel:
         sequence="`update` replaces vectors and keeps the analysis; no warm starts",
     )
 
-    def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
-
-    def declines(self, qp: QP) -> str | None:
-        return needs_matrices(qp)
-
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol, presolve=True).solve
-
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         return chain(partial(self._begin, presolve=False), tol)
 
-    def _begin(self, qp: QP, tol: float, *, presolve: bool) -> Session:
+    def library(self) -> Any:
+        import clarabel
+
+        return clarabel.DefaultSettings()
+
+    def _begin(self, qp: QP, tol: float, *, presolve: bool = True) -> Session:
         import clarabel
 
         form = to_cone(qp)
@@ -94,11 +89,16 @@ class Clarabel:
             *map(clarabel.SecondOrderConeT, form.cones.tolist()),
         ]
         settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.max_threads = 1
-        settings.max_iter = self.max_iter
-        settings.tol_feas = settings.tol_gap_abs = settings.tol_gap_rel = tol
-        settings.presolve_enable = presolve  # presolved problems cannot be updated
+        self.tune(
+            settings,
+            verbose=False,
+            max_threads=1,
+            max_iter=self.max_iter,
+            tol_feas=tol,
+            tol_gap_abs=tol,
+            tol_gap_rel=tol,
+            presolve_enable=presolve,  # presolved problems cannot be updated
+        )
         scale = objective_factor(qp)
         P = csc(triu(csc(qp.P))) * scale
         solver = clarabel.DefaultSolver(

@@ -24,6 +24,8 @@ from mortarbench.harness import (
     Status,
     needs_matrices,
 )
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.common.adapter import Adapter
 from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
@@ -83,7 +85,7 @@ CLAIMS = {
 
 
 @dataclass(frozen=True)
-class CVXPY:
+class CVXPY(Adapter):
     """One backend of cvxpy.
 
     The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
@@ -134,11 +136,16 @@ class CVXPY:
             return "needs a row or a bound"
         return DECLINED_BACKENDS.get(self.backend) or needs_matrices(qp)
 
+    def library(self) -> Any:
+        direct: Any = SOLVERS.get(self.backend.lower())
+        return direct.library() if isinstance(direct, Adapter) else None
+
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import cvxpy
 
         call, form = CALLS.get(self.backend, Call()), to_cone(qp)
-        options, scale = call.options(tol), objective_factor(qp, call.size)
+        options = self.tuned(**call.options(tol))
+        scale = objective_factor(qp, call.size)
         problem, x, constraints = _model(cvxpy, qp, form, scale)
         data, chain, inverse = problem.get_problem_data(
             self.backend, solver_opts=dict(options)

@@ -7,20 +7,19 @@ quadratic programming using recursive LDLᵀ updates, IEEE Trans. Automat. Contr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, Vector
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
-    check_positive,
     dense,
     needs_dense,
     objective_factor,
 )
-from mortarbench.solvers.common.sequence import Session, chain
+from mortarbench.solvers.common.sequence import Session
 
 CLAIMS = {
     1: Status.SOLVED,
@@ -49,7 +48,7 @@ MIN_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True)
-class DAQP:
+class DAQP(SequenceAdapter):
     """https://darnstrom.github.io/daqp, with dense matrices.
 
     At the final active set of DAQP, the KKT conditions hold up to rounding. The options
@@ -81,17 +80,13 @@ class DAQP:
         ),
     )
 
-    def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
-
     def declines(self, qp: QP) -> str | None:
         return needs_dense(qp, 3)
 
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol).solve
+    def library(self) -> Any:
+        import daqp
 
-    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return chain(self._begin, tol)
+        return daqp.Model().settings
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import daqp
@@ -104,7 +99,7 @@ class DAQP:
         sense[n : n + m] = EQUALITY
         eps = max(tol * TOL_FACTOR, MIN_TOLERANCE)
         model = daqp.Model()
-        model.settings = dict(
+        model.settings = self.tuned(
             primal_tol=eps, dual_tol=eps, iter_limit=self.max_iter, eps_prox=-1.0
         )
         _, setup_seconds = model.setup(H, qp.q * scale, A, high, low, sense)

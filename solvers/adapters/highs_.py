@@ -23,9 +23,9 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
+from mortarbench.solvers.common.adapter import Adapter
 from mortarbench.solvers.common.conversion import (
     check_choice,
-    check_positive,
     csc,
     needs_dense,
     objective_factor,
@@ -46,7 +46,7 @@ MIN_ENTRY = 1e-12  #: smallest value of small_matrix_value that HiGHS accepts
 
 
 @dataclass(frozen=True)
-class HiGHS:
+class HiGHS(Adapter):
     """https://highs.dev, with one thread and the method qpasm or hipo.
 
     HiGHS tests violations and multiplier signs in absolute terms. Therefore the
@@ -95,7 +95,7 @@ class HiGHS:
     )
 
     def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
+        super().__post_init__()
         check_choice("method", self.method, ("qpasm", "hipo"))
 
     def declines(self, qp: QP) -> str | None:
@@ -104,6 +104,11 @@ class HiGHS:
         if find_spec("highspy_extras") is None:  # HiGHS would run qpasm instead
             return "not installed: highspy_extras (pip install highspy-extras)"
         return needs_matrices(qp)
+
+    def library(self) -> Any:
+        import highspy
+
+        return highspy.Highs().getOptions()
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import highspy
@@ -155,18 +160,18 @@ class HiGHS:
 
     def _options(self, tol: float) -> dict[str, Any]:
         eps = max(tol / 100, MIN_TOLERANCE)
-        return {
-            "output_flag": False,
-            "threads": 1,
-            "solver": self.method,
-            "kkt_tolerance": eps,
-            "ipm_optimality_tolerance": eps,
-            "qp_regularization_value": 0.0,
-            "small_matrix_value": MIN_ENTRY,
-            "qp_iteration_limit": self.max_iter,
-            "ipm_iteration_limit": self.max_iter,
-            "qp_nullspace_limit": 2**31 - 1,
-        }
+        return self.tuned(
+            output_flag=False,
+            threads=1,
+            solver=self.method,
+            kkt_tolerance=eps,
+            ipm_optimality_tolerance=eps,
+            qp_regularization_value=0.0,
+            small_matrix_value=MIN_ENTRY,
+            qp_iteration_limit=self.max_iter,
+            ipm_iteration_limit=self.max_iter,
+            qp_nullspace_limit=2**31 - 1,
+        )
 
 
 def _model(highspy: Any, qp: QP, scale: float) -> Any:

@@ -6,23 +6,22 @@ programs, Math. Program. Comput. 12 (2020) 637-672.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from scipy.sparse import triu
 
-from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, needs_matrices
+from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
-    check_positive,
     csc,
     from_two_sided,
     objective_factor,
     to_two_sided,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, chain
+from mortarbench.solvers.common.sequence import Session
 
 PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
@@ -37,7 +36,7 @@ CLAIMS = {
 
 
 @dataclass(frozen=True)
-class OSQP:
+class OSQP(SequenceAdapter):
     """https://osqp.org, with its built-in linear algebra (QDLDL) and one thread.
 
     OSQP stops when the max norms of the primal and dual residuals and the duality gap
@@ -72,17 +71,13 @@ class OSQP:
         ),
     )
 
-    def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
+    def library(self) -> Any:
+        import osqp
 
-    def declines(self, qp: QP) -> str | None:
-        return needs_matrices(qp)
-
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol).solve
-
-    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return chain(self._begin, tol)
+        ext = osqp.OSQP(algebra="builtin").ext
+        settings = ext.OSQPSettings()
+        ext.osqp_set_default_settings(settings)
+        return settings
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import osqp
@@ -96,12 +91,14 @@ class OSQP:
             rows,
             low,
             high,
-            eps_abs=NEGLIGIBLE,
-            eps_rel=tol,
-            check_dualgap=True,
-            max_iter=self.max_iter,
-            polishing=self.polishing,
-            verbose=False,
+            **self.tuned(
+                eps_abs=NEGLIGIBLE,
+                eps_rel=tol,
+                check_dualgap=True,
+                max_iter=self.max_iter,
+                polishing=self.polishing,
+                verbose=False,
+            ),
         )
 
         def solve() -> Solution:

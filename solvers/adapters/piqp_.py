@@ -6,24 +6,23 @@ solver, Proc. 62nd IEEE Conf. Decision and Control (2023) 1088-1093.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_choice,
-    check_positive,
     csc,
     dense,
     needs_dense,
     objective_factor,
     resolve_backend,
 )
-from mortarbench.solvers.common.sequence import Session, chain
+from mortarbench.solvers.common.sequence import Session
 
 PRIMAL = "PIQP_PRIMAL_INFEASIBLE"
 CLAIMS = {
@@ -35,7 +34,7 @@ CLAIMS = {
 
 
 @dataclass(frozen=True)
-class PIQP:
+class PIQP(SequenceAdapter):
     """https://predict-epfl.github.io/piqp.
 
     PIQP stops when the max norms of the residuals and the duality gap are each below
@@ -59,18 +58,17 @@ class PIQP:
     )
 
     def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
+        super().__post_init__()
         check_choice("backend", self.backend, ("auto", "dense", "sparse"))
 
     def declines(self, qp: QP) -> str | None:
         as_dense = resolve_backend(self.backend, qp) == "dense"
         return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol).solve
+    def library(self) -> Any:
+        import piqp
 
-    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return chain(self._begin, tol)
+        return piqp.SparseSolver().settings
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import piqp
@@ -79,10 +77,16 @@ class PIQP:
         convert = (lambda M: np.asfortranarray(dense(M))) if is_dense else csc
         solver = piqp.DenseSolver() if is_dense else piqp.SparseSolver()
         s = solver.settings
-        s.eps_abs = s.eps_duality_gap_abs = NEGLIGIBLE
-        s.eps_rel = s.eps_duality_gap_rel = tol
-        s.check_duality_gap = s.compute_timings = True
-        s.max_iter = self.max_iter
+        self.tune(
+            s,
+            eps_abs=NEGLIGIBLE,
+            eps_duality_gap_abs=NEGLIGIBLE,
+            eps_rel=tol,
+            eps_duality_gap_rel=tol,
+            check_duality_gap=True,
+            compute_timings=True,
+            max_iter=self.max_iter,
+        )
         scale = objective_factor(qp)
         P, A, G = convert(qp.P) * scale, convert(qp.A), convert(qp.G)
         solver.setup(P, qp.q * scale, A, qp.b, G, None, qp.h, qp.lb, qp.ub)

@@ -6,7 +6,6 @@ robotics and beyond, Robotics: Science and Systems (2022).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -21,10 +20,10 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_choice,
-    check_positive,
     csc,
     dense,
     from_two_sided,
@@ -34,7 +33,7 @@ from mortarbench.solvers.common.conversion import (
     resolve_backend,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, chain
+from mortarbench.solvers.common.sequence import Session
 
 PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
@@ -48,7 +47,7 @@ CERTIFICATE = 1e-8  #: tolerance of an infeasibility certificate
 
 
 @dataclass(frozen=True)
-class ProxQP:
+class ProxQP(SequenceAdapter):
     """https://simple-robotics.github.io/proxsuite.
 
     ProxQP stops when the max norms of the primal and dual residuals are each below
@@ -90,32 +89,39 @@ class ProxQP:
     )
 
     def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
+        super().__post_init__()
         check_choice("backend", self.backend, ("auto", "dense", "sparse"))
 
     def declines(self, qp: QP) -> str | None:
         as_dense = resolve_backend(self.backend, qp) == "dense"
         return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol).solve
+    def library(self) -> Any:
+        from proxsuite import proxqp
 
-    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return chain(self._begin, tol)
+        return proxqp.Settings()
 
     def _begin(self, qp: QP, tol: float) -> Session:
         from proxsuite import proxqp
 
         backend = resolve_backend(self.backend, qp)
         form = _Dense(qp) if backend == "dense" else _Sparse(qp)
-        solver = form.set_up_solver(proxqp)
+        solver = form.new_solver(proxqp)
         settings = solver.settings
-        settings.eps_abs = settings.eps_duality_gap_abs = NEGLIGIBLE
-        settings.eps_rel = settings.eps_duality_gap_rel = tol
-        settings.check_duality_gap = settings.compute_timings = True
-        settings.eps_primal_inf = settings.eps_dual_inf = CERTIFICATE
-        settings.initial_guess = proxqp.NO_INITIAL_GUESS
-        settings.max_iter = self.max_iter
+        self.tune(
+            settings,
+            eps_abs=NEGLIGIBLE,
+            eps_duality_gap_abs=NEGLIGIBLE,
+            eps_rel=tol,
+            eps_duality_gap_rel=tol,
+            check_duality_gap=True,
+            compute_timings=True,
+            eps_primal_inf=CERTIFICATE,
+            eps_dual_inf=CERTIFICATE,
+            initial_guess=proxqp.NO_INITIAL_GUESS,
+            max_iter=self.max_iter,
+        )
+        form.initialise(solver)
         starts: list[Solution] = []
 
         def solve() -> Solution:
@@ -161,12 +167,14 @@ class _Dense:
     def __init__(self, qp: QP) -> None:
         self.qp, self.has_box = qp, bool(has_bound(qp).any())
 
-    def set_up_solver(self, proxqp: Any) -> Any:
+    def new_solver(self, proxqp: Any) -> Any:
         qp = self.qp
-        solver = proxqp.dense.QP(qp.q.size, qp.b.size, qp.h.size, self.has_box)
+        return proxqp.dense.QP(qp.q.size, qp.b.size, qp.h.size, self.has_box)
+
+    def initialise(self, solver: Any) -> None:
+        qp = self.qp
         P, A, G = dense(qp.P), dense(qp.A), dense(qp.G)
         solver.init(P, qp.q, A, qp.b, G, **self.sides(qp))
-        return solver
 
     def sides(self, qp: QP) -> dict[str, Vector]:
         box = {"l_box": qp.lb, "u_box": qp.ub} if self.has_box else {}
@@ -187,12 +195,13 @@ class _Sparse:
     def __init__(self, qp: QP) -> None:
         self.qp = qp
 
-    def set_up_solver(self, proxqp: Any) -> Any:
+    def new_solver(self, proxqp: Any) -> Any:
+        self.rows = csc(two_sided(self.qp)[0][self.qp.b.size :])
+        return proxqp.sparse.QP(self.qp.q.size, self.qp.b.size, self.rows.shape[0])
+
+    def initialise(self, solver: Any) -> None:
         qp = self.qp
-        rows = csc(two_sided(qp)[0][qp.b.size :])
-        solver = proxqp.sparse.QP(qp.q.size, qp.b.size, rows.shape[0])
-        solver.init(csc(qp.P), qp.q, csc(qp.A), qp.b, rows, **self.sides(qp))
-        return solver
+        solver.init(csc(qp.P), qp.q, csc(qp.A), qp.b, self.rows, **self.sides(qp))
 
     def sides(self, qp: QP) -> dict[str, Vector]:
         _, low, high = two_sided(qp)

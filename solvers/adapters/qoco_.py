@@ -6,23 +6,22 @@ custom solver generation, arXiv:2503.12658 (2025).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.harness import QP, About, Solution, Status
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     DIVERGED,
     NEGLIGIBLE,
-    check_positive,
     csc,
     objective_factor,
     to_cone,
 )
-from mortarbench.solvers.common.sequence import Session, chain
+from mortarbench.solvers.common.sequence import Session
 
 CLAIMS = {
     "QOCO_SOLVED": Status.SOLVED,
@@ -31,7 +30,7 @@ CLAIMS = {
 
 
 @dataclass(frozen=True)
-class QOCO:
+class QOCO(SequenceAdapter):
     """https://qoco-org.github.io/qoco.
 
     QOCO stops when the max norms of the residuals are each below abstol + reltol·(their
@@ -61,17 +60,13 @@ class QOCO:
         ),
     )
 
-    def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
+    def library(self) -> Any:
+        import qoco
 
-    def declines(self, qp: QP) -> str | None:
-        return needs_matrices(qp)
-
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol).solve
-
-    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return chain(self._begin, tol)
+        ext = qoco.QOCO().ext
+        settings = ext.QOCOSettings()
+        ext.set_default_settings(settings)
+        return settings
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import qoco
@@ -93,12 +88,14 @@ class QOCO:
             form.inequalities,
             form.cones.size,
             form.cones.astype(np.int32),
-            abstol=NEGLIGIBLE,
-            reltol=tol,
-            abstol_inacc=NEGLIGIBLE,
-            reltol_inacc=tol,
-            max_iters=self.max_iter,
-            verbose=0,
+            **self.tuned(
+                abstol=NEGLIGIBLE,
+                reltol=tol,
+                abstol_inacc=NEGLIGIBLE,
+                reltol_inacc=tol,
+                max_iters=self.max_iter,
+                verbose=0,
+            ),
         )
 
         def solve() -> Solution:

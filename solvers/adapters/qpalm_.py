@@ -6,9 +6,8 @@ method for nonconvex quadratic programs, Math. Program. Comput. 14 (2022) 497-54
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,17 +18,16 @@ from mortarbench.harness import (
     Solution,
     Status,
     Vector,
-    needs_matrices,
 )
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
-    check_positive,
     csc,
     from_two_sided,
     to_two_sided,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, chain
+from mortarbench.solvers.common.sequence import Session
 
 PRIMAL = "PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
@@ -43,7 +41,7 @@ INFINITE = 1e20  #: QPALM's value for an absent bound
 
 
 @dataclass(frozen=True)
-class QPALM:
+class QPALM(SequenceAdapter):
     """https://kul-optec.github.io/QPALM.
 
     QPALM stops when the max norms of the primal and dual residuals are each below
@@ -67,17 +65,10 @@ class QPALM:
         ),
     )
 
-    def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
+    def library(self) -> Any:
+        import qpalm
 
-    def declines(self, qp: QP) -> str | None:
-        return needs_matrices(qp)
-
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol).solve
-
-    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return chain(self._begin, tol)
+        return qpalm.Settings()
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import qpalm
@@ -87,9 +78,9 @@ class QPALM:
         data.Q, data.q, data.A = csc(qp.P), qp.q, rows
         data.bmin, data.bmax = low, high
         settings = qpalm.Settings()
-        settings.eps_abs, settings.eps_rel = NEGLIGIBLE, tol
-        settings.eps_rel_in = min(1.0, settings.eps_rel_in)
-        settings.max_iter, settings.verbose = self.max_iter, 0
+        self.tune(
+            settings, eps_abs=NEGLIGIBLE, eps_rel=tol, max_iter=self.max_iter, verbose=0
+        )
         solver = qpalm.Solver(data, settings)
         starts: list[tuple[Vector, Vector]] = []
 

@@ -26,6 +26,8 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.common.adapter import Adapter
 from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
@@ -98,7 +100,7 @@ STATUS_PATTERNS = (
 
 
 @dataclass(frozen=True)
-class QPSolvers:
+class QPSolvers(Adapter):
     """One backend of qpsolvers.
 
     The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
@@ -153,6 +155,10 @@ class QPSolvers:
         dense_only = self.backend in DENSE_BACKENDS
         return needs_dense(qp, 4) if dense_only else needs_matrices(qp)
 
+    def library(self) -> Any:
+        direct: Any = SOLVERS.get(self.backend)
+        return direct.library() if isinstance(direct, Adapter) else None
+
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         if self.backend not in NEEDS_FIXED_IN_ROWS:
             return self._prepare(qp, tol)
@@ -164,7 +170,8 @@ class QPSolvers:
         import qpsolvers
 
         call = CALLS.get(self.backend, Call())
-        options, scale = call.options(tol), objective_factor(qp, call.size)
+        options = self.tuned(**call.options(tol))
+        scale = objective_factor(qp, call.size)
         takes_dense = self.backend in qpsolvers.dense_solvers
         as_dense = takes_dense and isinstance(qp.P, np.ndarray)
         convert = dense if as_dense or self.backend in DENSE_BACKENDS else csc

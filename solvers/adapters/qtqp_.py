@@ -5,9 +5,9 @@ Reference: https://github.com/google-deepmind/qtqp.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from inspect import signature
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -20,14 +20,14 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
     check_choice,
-    check_positive,
     csc,
     objective_factor,
     to_cone,
 )
-from mortarbench.solvers.common.sequence import Session, chain
+from mortarbench.solvers.common.sequence import Session
 
 PRIMAL = "infeasible"  #: status with a certificate of infeasibility
 CLAIMS = {
@@ -40,7 +40,7 @@ LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
 
 
 @dataclass(frozen=True)
-class QTQP:
+class QTQP(SequenceAdapter):
     """https://github.com/google-deepmind/qtqp.
 
     QTQP divides each residual by max(1, size of its terms). The gap must be below tol,
@@ -79,7 +79,7 @@ class QTQP:
     )
 
     def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
+        super().__post_init__()
         check_choice("linear_solver", self.linear_solver, LINEAR_SOLVERS)
 
     def declines(self, qp: QP) -> str | None:
@@ -87,11 +87,11 @@ class QTQP:
             return "needs an inequality row or a bound"
         return needs_matrices(qp)
 
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol).solve
+    def library(self) -> Any:
+        import qtqp
 
-    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return chain(self._begin, tol)
+        parameters = signature(qtqp.QTQP.solve).parameters
+        return {name: p.default for name, p in parameters.items() if name != "self"}
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import qtqp
@@ -106,14 +106,16 @@ class QTQP:
 
         def solve() -> Solution:
             r = solver.solve(
-                tol_feas=tol,
-                tol_gap_abs=tol,
-                tol_gap_rel=tol,
-                linear_solver=kind,
-                max_iter=self.max_iter,
-                collect_stats=True,
-                verbose=False,
                 warm_start=start,
+                **self.tuned(
+                    tol_feas=tol,
+                    tol_gap_abs=tol,
+                    tol_gap_rel=tol,
+                    linear_solver=kind,
+                    max_iter=self.max_iter,
+                    collect_stats=True,
+                    verbose=False,
+                ),
             )
             message = r.status.value
             status = CLAIMS.get(message, Status.FAILED)

@@ -6,22 +6,23 @@ complementarity problem, SIAM J. Optim. 31 (2021) 1999-2023.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 from scipy.sparse import triu
 
 from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.adapter import SequenceAdapter
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     NEGLIGIBLE,
     check_choice,
-    check_positive,
     csc,
     to_cone,
 )
-from mortarbench.solvers.common.sequence import Session, chain
+from mortarbench.solvers.common.sequence import Session
 
 PRIMAL = -2  #: status with a certificate of infeasibility
 CLAIMS = {
@@ -34,7 +35,7 @@ CERTIFICATE = 1e-9  #: tolerance of a certificate of infeasibility
 
 
 @dataclass(frozen=True)
-class SCS:
+class SCS(SequenceAdapter):
     """https://www.cvxgrp.org/scs.
 
     SCS stops when the max norms of the primal and dual residuals and the duality gap
@@ -61,20 +62,20 @@ class SCS:
     )
 
     def __post_init__(self) -> None:
-        check_positive(max_iter=self.max_iter)
+        super().__post_init__()
         check_choice("linear_solver", self.linear_solver, ("auto", "mkl", "qdldl"))
+        if self.settings:  # SCS does not list its settings, but refuses unknown ones
+            with suppress(ImportError):
+                import scs
+
+                data = dict(A=csc([[1.0]]), b=np.ones(1), c=np.ones(1))
+                scs.SCS(data, {"l": 1}, **{"verbose": False, **self.settings})
 
     def declines(self, qp: QP) -> str | None:
         rows = ("equalities", "inequalities", "bounds")
         if len(qp.sets) == 1 and not any(qp.sizes[k] for k in rows):
             return "needs a constraint, because SCS rejects an empty cone"
         return needs_matrices(qp)
-
-    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return self._begin(qp, tol).solve
-
-    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import scs
@@ -84,11 +85,13 @@ class SCS:
             dict(P=csc(triu(csc(qp.P))), A=form.rows, b=form.rhs, c=qp.q.copy()),
             dict(z=form.equalities, l=form.inequalities, q=form.cones.tolist()),
             linear_solver=scs.LinearSolver(self.linear_solver),
-            eps_abs=NEGLIGIBLE,
-            eps_rel=tol,
-            eps_infeas=CERTIFICATE,
-            max_iters=self.max_iter,
-            verbose=False,
+            **self.tuned(
+                eps_abs=NEGLIGIBLE,
+                eps_rel=tol,
+                eps_infeas=CERTIFICATE,
+                max_iters=self.max_iter,
+                verbose=False,
+            ),
         )
         starts: list[Solution] = []
 

@@ -288,7 +288,7 @@ def test_doctor_describes_the_machine(cli):
 
     assert code == 0
     assert "numpy" in out
-    assert "→" not in out or "warn" in out
+    assert ("→" in out) == ("to change" in out)
 
 
 def test_doctor_prints_the_same_as_json(cli):
@@ -297,8 +297,7 @@ def test_doctor_prints_the_same_as_json(cli):
 
     assert code == 0
     assert told["environment"]["versions"]["numpy"]
-    assert {check["level"] for check in told["checks"]} <= {"ok", "warn", "unknown"}
-    assert told["fit"] == all(c["level"] != "warn" for c in told["checks"])
+    assert told["fit"] == (not told["advice"])
 
 
 def test_an_interrupt_exits_with_130_and_one_line(cli):

@@ -157,7 +157,7 @@ def test_a_planted_error_is_measured_and_only_its_solver_is_named(
 
 
 @pytest.mark.slow
-def test_answers_of_all_forms_that_are_exact_agree(truths, tmp_path, cli, only_svg):
+def test_answers_of_all_forms_that_are_exact_agree(truths, tmp_path, cli):
     answers = [
         (label, f"{BEAM}/step={step}/{form}", s)
         for (step, form), (_, s) in truths.items()
@@ -544,15 +544,14 @@ def test_a_file_at_the_path_of_the_page_is_reported_with_the_remedy(
 
 
 def test_hostile_names_and_huge_numbers_do_not_break_page_or_terminal(
-    truths, tmp_path, cli, svg_only
+    truths, tmp_path, cli
 ):
     _, s = truths[2, "primal"]
     name = "<b>evil</b>\x1b[31m\n|x"
     huge = replace(s, x=np.full_like(s.x, 1e300))
     answers = [("a", f"{BEAM}/primal", s), (name, f"{BEAM}/primal", huge)]
 
-    with svg_only():
-        code, out, _ = cli(write(tmp_path, answers), validation_page=write_validation)
+    code, out, _ = cli(write(tmp_path, answers), validation_page=write_validation)
 
     def refuse(constant):
         raise AssertionError(constant)

@@ -31,7 +31,6 @@ from mortarbench.reports.figures.sweeps import (
 )
 from mortarbench.reports.folder import compose
 from mortarbench.reports.render.saving import draw, draw_svg
-from mortarbench.reports.validation.error_figure import error_figure
 from tests.support.synthetic_results import records
 
 pytestmark = pytest.mark.together
@@ -218,22 +217,6 @@ def test_ratios_name_the_measurements_after():
 
     assert runs
     assert set(runs) <= {r.run_id for r in after}
-
-
-def test_every_certified_error_names_its_answer():
-    answers = [
-        {"solver": s, "form": "primal", "outcome": "agrees", "tol": 1e-6,
-         "bound": e, "run_id": f"{s}{e}"}
-        for s in "ba" for e in (1e-8, 1e-7)
-    ]  # fmt: skip
-    figure = error_figure(answers, 1e-6)
-    points = {(solver, x): runs for (solver, x, _), runs in told(figure).items()}
-
-    assert points == {(a["solver"], a["bound"]): (a["run_id"],) for a in answers}
-    (panel,) = figure.panels
-    rows = {one.solver: one.y for one in series(figure)}
-    names = {name: at for at, name in panel.y.ticks}
-    assert all(abs(y - names[s]) < 0.5 for s, ys in rows.items() for y in ys)
 
 
 def test_all_figures_of_a_report_are_plain_data(campaign):
