@@ -10,7 +10,6 @@ import json
 from collections.abc import Mapping
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
 from sys import stderr
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,7 +23,7 @@ from mortarbench.harness.processes.termination import ended_by_signals
 from mortarbench.harness.record import finite
 from mortarbench.harness.registry import SolverSpec, check_solver, options_of, resolve
 from mortarbench.registries import TURN, Plugins, one_thread
-from mortarbench.text import outcome, outcome_rows
+from mortarbench.text import outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -250,17 +249,6 @@ class Answer:
     def __repr__(self) -> str:
         notes = (f"note: {text}" for text in self.remarks)
         return "\n".join([outcome(self.record, self.defaults), *notes])
-
-    def _repr_html_(self) -> str:
-        rows = (
-            f"<tr><th style='text-align:left'>{escape(name)}</th>"
-            f"<td style='text-align:left'>{escape(value)}</td></tr>"
-            for name, value in (
-                *outcome_rows(self.record, self.defaults),
-                *(("note", text) for text in self.remarks),
-            )
-        )
-        return f"<table>{''.join(rows)}</table>"
 
 
 @TURN

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property, partial
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,7 +29,7 @@ from mortarbench.harness.suite.suite import as_toml, parse_suite, suite_file
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import TURN, Plugins, Registries, load_registries
 from mortarbench.reporting import Report, report
-from mortarbench.text import summary, summary_rows
+from mortarbench.text import summary
 from mortarbench.validation import Validation, validate
 
 if TYPE_CHECKING:
@@ -164,15 +163,6 @@ class Results:
     def __repr__(self) -> str:
         text = [summary(self.records, self.solvers), *self.shortfall]
         return "\n".join(text)
-
-    def _repr_html_(self) -> str:
-        head, *rows = summary_rows(self.records, self.solvers)
-        cells = [
-            "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in row)
-            for tag, row in [("th", head), *(("td", row) for row in rows)]
-        ]
-        notes = "".join(f"<p>{escape(line)}</p>" for line in self.shortfall)
-        return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>{notes}"
 
 
 def _named(r: Record) -> dict[str, Any]:

@@ -121,13 +121,7 @@ def listing(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def summary(records: Sequence[Record], solvers: Sequence[str]) -> str:
-    """Return `summary_rows` as aligned text."""
-    rows = summary_rows(records, solvers)
-    return align(rows, right=range(1, len(rows[0])))
-
-
-def summary_rows(records: Sequence[Record], solvers: Sequence[str]) -> list[list[str]]:
-    """Count the claims and verdicts of each solver; return a table with a header row.
+    """Count the claims and verdicts of each solver, in a table with a header.
 
     The rows of `solvers` come first, followed by the rows of other solvers in
     `records`.
@@ -153,16 +147,11 @@ def summary_rows(records: Sequence[Record], solvers: Sequence[str]) -> list[list
         other = len(measured) - len(verified) - len(refuted)
         counts = map(len, (measured, claimed, verified, refuted, declined))
         rows.append([solver, *map(str, counts), str(other)])
-    return rows
+    return align(rows, right=range(1, len(header)))
 
 
 def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
-    """Return `outcome_rows` as aligned text."""
-    return align(outcome_rows(r, defaults))
-
-
-def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the results of one measurement as pairs of name and value, in SI units.
+    """Return the results of one measurement as rows of name and value, in SI units.
 
     defaults : default options of the solver; options with these values are omitted
     """
@@ -201,7 +190,7 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
         ),
         *_contacts(r.quantities.get(_CONTACTS), f"N{per}"),
     ]
-    return [(name, value) for name, value in rows if value]
+    return align([(name, value) for name, value in rows if value])
 
 
 def _units(per: str) -> Mapping[str, str]:

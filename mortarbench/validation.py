@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from html import escape
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -47,9 +46,6 @@ class Validation:
 
     def __repr__(self) -> str:
         return as_text(self.data)
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def validate(
@@ -224,9 +220,6 @@ class Conformance:
                 seen.add((r.grade, r.message))
                 message += f" (the same in {count} checks)"
             yield r.grade, name, message
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def test_solver(

@@ -3,7 +3,8 @@
 import json
 from pathlib import Path
 
-from mortarbench.cli.list import solvers_pages
+from solver_pages import solvers_pages
+
 from mortarbench.listing import CATALOGUE, describe
 from mortarbench.solvers import SOLVERS
 

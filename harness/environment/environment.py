@@ -17,11 +17,8 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-
-from threadpoolctl import threadpool_info
 
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.registry import PluginFile
@@ -59,6 +56,8 @@ def capture(
     plugins : plug-in files; digests of their code are included
     packages : packages of solvers whose versions are included
     """
+    from threadpoolctl import threadpool_info
+
     # import these modules, since threadpoolctl finds only loaded libraries
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
         with suppress(ImportError):
@@ -219,6 +218,8 @@ def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _version(package: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(package)
     except PackageNotFoundError:

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import sys
 from importlib.metadata import version
 
 import pytest
@@ -9,7 +10,6 @@ import yaml
 
 from mortarbench.answer import solve
 from mortarbench.case import build
-from mortarbench.cli.list import solvers_page, solvers_pages
 from mortarbench.cli.main import command_parser, main
 from mortarbench.harness import (
     InputError,
@@ -30,6 +30,9 @@ from mortarbench.reports.data.aggregation import Convention
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT
+
+sys.path.append(str(ROOT / "tools"))
+from solver_pages import solvers_pages  # tools/solver_pages.py, which writes the pages
 
 DOCUMENTS = [
     *sorted((ROOT / "docs").glob("*.md")),
@@ -107,19 +110,13 @@ def test_the_adapter_that_the_contributing_guide_shows_is_the_real_one():
 
 
 def test_the_pages_of_solvers_are_up_to_date():
-    """The pages equal the output of `make docs` and together contain every section."""
-    pages = solvers_pages(SOLVERS)
-
-    for name, text in pages.items():
+    """The pages equal the output of `make docs`."""
+    for name, text in solvers_pages(SOLVERS).items():
         assert (ROOT / "docs" / name).read_text("utf-8") == text
-    heads = re.findall(r"^## .*$", solvers_page(SOLVERS), re.M)
-    assert sorted(heads) == sorted(
-        re.findall(r"^## .*$", "\n".join(pages.values()), re.M)
-    )
 
 
 def test_the_page_of_solvers_states_the_facts_of_each():
-    page = solvers_page(SOLVERS)
+    page = "\n".join(solvers_pages(SOLVERS).values())
     for name, solver in SOLVERS.items():
         assert f"| `{name}` |" in page
         facts = about(solver)

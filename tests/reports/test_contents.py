@@ -23,7 +23,7 @@ from mortarbench.reports.render.latex import latex
 from mortarbench.reports.render.markdown import markdown
 from mortarbench.reports.render.saving import draw
 from mortarbench.reports.statistics.intervals import PowerLaw, median_interval
-from mortarbench.text import outcome_rows
+from mortarbench.text import outcome
 
 ELASTIC = {
     "dofs": 20, "equality_rows": 4, "contact_rows": 10, "active": 5,
@@ -281,7 +281,7 @@ def test_bodies_in_3d_have_forces_in_newtons_and_others_per_metre(measured, page
         composed = page(made)
         (heads,) = (t.columns for t in section(composed, "physics").tables[1:])
         (energies,) = map(rows, section(composed, "energies").tables)
-        told = dict(outcome_rows(made[0], {}))
+        told = dict(re.split(" {2,}", r) for r in outcome(made[0], {}).splitlines())
 
         assert {f"contact force x in N{per}", f"energy in J{per}"} <= set(heads)
         assert energies[0]["energy"].after == f"J{per}"
