@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import linregress, t
 
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.models.beam_ring import model
@@ -45,7 +45,7 @@ def one(form, Nr):
     lap()
     u = np.zeros(bodies.mesh.dofs)
     slave, master, *_ = bodies.pairs[0]
-    rows = node_to_segment(bodies.mesh.points, u, slave, master)
+    rows = node_to_facet(bodies.mesh.points, u, slave, master)
     dual = transform(primal_qp(bodies, rows), inverse)
     lap()
     s = SMALBE().prepare(dual.qp, 1e-8)()

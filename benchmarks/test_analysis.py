@@ -16,7 +16,7 @@ from scipy.sparse import csc_matrix
 from sksparse.cholmod import cholesky
 
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.stepping import forces_of, load_steps
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import load_path, recovered
@@ -50,7 +50,7 @@ def analysis(form, Nr=30, Nh=15, steps=10):
     def linearise(u):
         lap("recovery")
         slave, master, *_ = bodies.pairs[0]
-        rows = node_to_segment(bodies.mesh.points, u, slave, master)
+        rows = node_to_facet(bodies.mesh.points, u, slave, master)
         lap("contact rows")
         return rows
 

@@ -5,11 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from mortarbench.problems.contact.closest import closest_points, divided
+from mortarbench.problems.contact.face_mortar import face_mortar
 from mortarbench.problems.contact.mortar import mortar
-from mortarbench.problems.contact.node_to_segment import node_to_segment
-from mortarbench.problems.contact.segment_search import nearest
-from mortarbench.problems.contact.space.face_mortar import face_mortar
-from mortarbench.problems.contact.space.node_to_face import node_to_face
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.surface import surface
 from mortarbench.problems.fem.elasticity import (
     Material,
@@ -21,7 +20,7 @@ from mortarbench.problems.fem.mesh import box, join, prefixed
 from mortarbench.problems.models.beam_ring import model
 
 
-@pytest.mark.parametrize("method", [node_to_segment, mortar])
+@pytest.mark.parametrize("method", [node_to_facet, mortar])
 def test_ten_linearisations(benchmark, method):
     bodies = model(30, 15, 30, "strain")
     points, (pair,) = bodies.mesh.points, bodies.pairs
@@ -45,12 +44,14 @@ def test_search(benchmark, segments):
     x = 2 * np.arange(segments + 1) / segments
     beam = np.column_stack([x, 0.5 - 0.025 * x**2])
 
-    projection = benchmark(lambda: nearest(ring, surface(beam, "master")))
+    projection = benchmark(
+        lambda: closest_points(ring, divided(surface(beam, "master")))
+    )
 
-    assert len(projection.segment) == segments
+    assert len(projection.facet) == segments
 
 
-@pytest.mark.parametrize("method", [node_to_segment, mortar])
+@pytest.mark.parametrize("method", [node_to_facet, mortar])
 def test_cost_per_segment(race, note, method):
     """Report the growth exponents of the time in the number of segments, by decade."""
 
@@ -87,7 +88,7 @@ def test_linearisation_in_3d_against_a_factorisation(race, note, cells):
 
     medians = race(
         factor=lambda: regular_inverse(K, free),
-        node_to_face=lambda: node_to_face(mesh.points, u, slave, master),
+        node_to_face=lambda: node_to_facet(mesh.points, u, slave, master),
         face_mortar=lambda: face_mortar(mesh.points, u, slave, master),
         rounds=3,
     )

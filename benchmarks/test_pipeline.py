@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.problems.fem.elasticity import elasticity_matrix, stiffness
@@ -34,7 +34,7 @@ def test_linearisation(benchmark, Nr, Nh):
     bodies = bodies_of(Nr, Nh)
     u = np.zeros(bodies.mesh.dofs)
 
-    rows = benchmark(node_to_segment, bodies.mesh.points, u, *bodies.pairs[0])
+    rows = benchmark(node_to_facet, bodies.mesh.points, u, *bodies.pairs[0])
 
     assert len(rows.c) == 12 * Nh + 1
 

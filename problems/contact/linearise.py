@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,31 +16,24 @@ from mortarbench.problems.contact.bodies import (
     ContactSides,
     UnassembledBodies,
 )
+from mortarbench.problems.contact.closest import closest_points, divided
+from mortarbench.problems.contact.face_mortar import face_mortar
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.mortar import mortar
-from mortarbench.problems.contact.node_to_segment import (
+from mortarbench.problems.contact.node_to_facet import (
     geometric_stiffness,
-    node_to_segment,
+    node_to_facet,
 )
 from mortarbench.problems.contact.rigid import rigid_rows
 from mortarbench.problems.contact.rows import ContactRows, joined
-from mortarbench.problems.contact.segment_search import Reach, closest_points
 from mortarbench.problems.contact.sides import pair_names
-from mortarbench.problems.contact.space.face_mortar import face_mortar
-from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.contact.surface import (
     Points,
+    Reach,
     current_positions,
     current_surface,
 )
 from mortarbench.problems.fem.mesh import Nodes
-
-#: mapping from the dimension to the functions that implement the methods "nts" and
-#: "mortar"
-METHODS: Mapping[int, tuple[Callable[..., ContactRows], Callable[..., ContactRows]]] = {
-    2: (node_to_segment, mortar),
-    3: (node_to_face, face_mortar),
-}
 
 
 def linearisation(
@@ -61,19 +54,19 @@ def linearisation(
     fixed_segments : (places,) segment of each slave node for node-to-segment contact,
         numbered as in `closest_segments`; −1 selects the closest segment at each u
     """
-    nodal, integral = METHODS[bodies.mesh.dim]
+    integral = mortar if bodies.mesh.dim == 2 else face_mortar
     pairs, nodes = bodies.pairs, [pair.slave_nodes for pair in bodies.pairs]
     methods: list[Callable[..., ContactRows]] = [
         rigid_rows
         if pair.rigid is not None
-        else nodal
+        else node_to_facet
         if contact == "nts"
         else partial(integral, basis=basis, reach=Reach(distance=pair.reach))
         for pair in pairs
     ]
     if fixed_segments is not None:
         parts = _split_by_pair(bodies, fixed_segments)
-        methods = [partial(node_to_segment, fixed_segments=part) for part in parts]
+        methods = [partial(node_to_facet, fixed_segments=part) for part in parts]
     size = float(np.ptp(bodies.mesh.points, axis=0).max())
     has_friction = [law.acts for law in laws] or [False] * len(pairs)
 
@@ -139,7 +132,7 @@ def contact_stiffness(
     """Return a function that evaluates the blocks −λ_i g_i''(u).
 
     The arguments of this function are u (n,) in m and λ (s,) in N/m, and its result is
-    that of `problems.contact.node_to_segment.geometric_stiffness` for all pairs.
+    that of `problems.contact.node_to_facet.geometric_stiffness` for all pairs.
     Contact is node to segment, and λ has one entry per slave node.
 
     fixed_segments : see `linearisation`
@@ -169,14 +162,14 @@ def closest_segments(bodies: Bodies, u: Vector) -> Nodes:
 
     Returns
     -------
-    (places,) first node of each segment, as a position in the chain of its master
+    (places,) segment of the master, as numbered in its `Surface`
 
     """
     segments = []
     for pair in bodies.pairs:
         x = current_positions(bodies.mesh.points, u, pair.slave, "slave")
         line = current_surface(bodies.mesh.points, u, pair.master, "master")
-        segments.append(closest_points(x, line).segment)
+        segments.append(closest_points(x, divided(line)).facet)
     return np.concatenate(segments)
 
 

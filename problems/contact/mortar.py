@@ -61,19 +61,25 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.rows import ContactRows
-from mortarbench.problems.contact.segment_search import Reach, facing_segments
+from mortarbench.problems.contact.rows import (
+    ContactRows,
+    gathered,
+    mortar_rows,
+    side_matrix,
+)
 from mortarbench.problems.contact.surface import (
     Points,
+    Reach,
     Surface,
     current_surface,
+    tangents,
     unit,
 )
 from mortarbench.problems.fem.elements import cross
-from mortarbench.problems.fem.mesh import Nodes, dofs_of
+from mortarbench.problems.fem.mesh import Nodes
 
 #: integration segments whose length in ξ is at most this value count as rounding errors
 #: of the projection and are dropped
@@ -82,6 +88,7 @@ MIN_SEGMENT = 1e-8
 #: of ν − n_j count as zero, so that B is as sparse on straight sides as with a single
 #: normal
 NORMAL_ROUNDING = 4 * np.finfo(float).eps
+PAIRS = 2**20  #: largest number of pairs of nodes that are evaluated at a time
 ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 Basis = Literal["dual", "standard"]
@@ -156,7 +163,9 @@ def mortar(
     m = current_surface(points, u, master, "master")
     integrals = integrate(s if part is None else s.part(part), m, basis, reach)
     j = np.flatnonzero(integrals.cover)
-    B = _rows(integrals, j, (slave, master), points.shape)
+    B = mortar_rows(
+        integrals.D, integrals.M, integrals.cover, (slave, master), points.size
+    )
     T = _rotated(B if tangential else B[:0])
     return ContactRows(
         B,
@@ -194,12 +203,41 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
     gap = np.einsum("pgj,pg->pj", phi, measure * gauss.gap)
     cover = np.einsum("pgj,pg->pj", N, measure)
     return Mortar(
-        _sum(D, j, j, (s, s)),
-        _sum(M, j, k, (s, v)),
-        _gather(gap, j, s),
-        _gather(cover, j, s),
-        _gather(np.einsum("pgj,pg->pj", N, gauss.weight), j, s),
+        side_matrix(D, j, j, (s, s)),
+        side_matrix(M, j, k, (s, v)),
+        gathered(gap, j, s),
+        gathered(cover, j, s),
+        gathered(np.einsum("pgj,pg->pj", N, gauss.weight), j, s),
     )
+
+
+def facing_segments(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
+    """Return the pairs of slave and master segments that may overlap along normals.
+
+    Let f_j(p) = (x_j − p) × n_j for the slave node j at x_j with the averaged normal
+    n_j. A point p lies between the lines along the normals of nodes j and j + 1 if
+    f_j(p) ≥ 0 ≥ f_{j+1}(p). The master segment of each returned pair has a point with
+    f_j ≥ 0 and a point with f_{j+1} ≤ 0.
+
+    Returns
+    -------
+    slave segments, master segments : (p,) each, sorted by slave segment
+
+    """
+    x, n = slave.x, slave.node_normal
+    offset, across = cross(x, n)[:, None], tangents(n)[:, 0]
+    (j, k), (a, b) = slave.facets.T, master.facets.T
+    pairs, step = [], max(PAIRS // len(master.x), 1)
+    for first in range(0, len(j), step):
+        part = slice(first, first + step)
+        # signs of f at the nodes of the master
+        at_j = across[j[part]] @ master.x.T >= -offset[j[part]]
+        at_k = across[k[part]] @ master.x.T <= -offset[k[part]]
+        above, below = at_j[:, a] | at_j[:, b], at_k[:, a] | at_k[:, b]
+        e, m = np.nonzero(above & below)
+        pairs.append((first + e, m))
+    e, m = map(np.concatenate, zip(*pairs, strict=True))
+    return e, m
 
 
 def overlaps(slave: Surface, master: Surface) -> Overlaps:
@@ -295,44 +333,6 @@ def _dual(gauss: GaussPoints) -> NDArray[np.float64]:
 def _shape(xi: NDArray[np.float64]) -> NDArray[np.float64]:
     """Evaluate N_1, N_2 at ξ, (…, 2)."""
     return np.stack([(1 - xi) / 2, (1 + xi) / 2], axis=-1)
-
-
-def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
-    """Sum values (p, 2) at nodes (p, 2) into a vector (count,)."""
-    total = np.bincount(nodes.ravel(), values.ravel(), minlength=count)
-    return total.astype(np.float64)  # bincount of an empty array returns integers
-
-
-def _sum(
-    vectors: NDArray[np.float64], rows: Nodes, nodes: Nodes, shape: tuple[int, int]
-) -> csr_array:
-    """Assemble vectors (p, 2, 2, dim) at rows (p, 2) × nodes (p, 2) into a matrix.
-
-    shape : numbers of rows and of nodes; each node has dim columns
-    """
-    dim = vectors.shape[-1]
-    i = np.repeat(rows, 2 * dim, axis=1)
-    j = np.tile(dofs_of(nodes, dim).reshape(-1, 2 * dim), (1, 2))
-    indices = (i.ravel(), j.ravel())
-    return csr_array(coo_array((vectors.ravel(), indices), (shape[0], dim * shape[1])))
-
-
-def _rows(
-    integrals: Mortar, j: Nodes, sides: tuple[Nodes, Nodes], shape: tuple[int, int]
-) -> csr_array:
-    """Assemble the matrix u ↦ (D u_s − M u_m)_j / cover_j for slave nodes j.
-
-    shape : (N, dim), number of nodes of the mesh and dimension
-    """
-    N, dim = shape
-    D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()
-    row = np.concatenate([D.row, M.row])
-    slave, master = (dofs_of(side, dim) for side in sides)
-    indices = (row, np.concatenate([slave[D.col], master[M.col]]))
-    values = np.concatenate([D.data, -M.data]) / integrals.cover[j][row]
-    B = csr_array(coo_array((values, indices), (len(j), N * dim)))
-    B.eliminate_zeros()
-    return B
 
 
 def _rotated(B: csr_array) -> csr_array:

@@ -33,10 +33,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
+from scipy.sparse import coo_array, csr_array, diags_array, eye_array, kron, vstack
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.surface import Points, Surface, tangents
+from mortarbench.problems.contact.surface import Points, Surface
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
 #: distance by which a slave node may be beyond the border of its master and still have
@@ -114,67 +114,7 @@ class ContactRows(NamedTuple):
         )
 
 
-class SlaveNodes(NamedTuple):
-    """Slave nodes of a pair."""
-
-    number: Nodes  #: (s,) numbers
-    x: Points  #: (s, dim) positions X + u^k, m
-    areas: Vector  #: (s,) lengths or areas ∫N_j of the slave side, m or m²
-
-
-class Feet(NamedTuple):
-    """Closest points of all s slave nodes on the master, which may be extended."""
-
-    node: Nodes  #: (s, a) nodes of the master facet with the closest point
-    #: (s, a) shape functions of these nodes at this point; extrapolated beyond a border
-    N: NDArray[np.float64]
-    x: Points  #: (s, dim) position, m
-    normal: Points  #: (s, dim) outward unit normal of the master
-    #: (s,) distance along the master by which a node is beyond its border, m; else 0
-    beyond: Vector
-    radius: Vector  #: (s,) radius of the master facet, m
-
-
-def nodal_rows(
-    u: Vector,
-    slave: SlaveNodes,
-    feet: Feet,
-    side: Callable[[], Surface],
-    integral: Callable[..., ContactRows],
-    *,
-    tangential: bool,
-) -> ContactRows:
-    """Return one row per slave node, except for nodes beyond the border of the master.
-
-    Parameters
-    ----------
-    u : (n,) displacement u^k at which to linearise, m
-    side : function that returns the slave side at X + u^k
-    integral : function that returns the mortar rows, with the basis N_j, of the slave
-        facets in a mask `part` (f,)
-    tangential : add tangential rows for friction
-
-    """
-    s, dim = slave.x.shape
-    gap = np.einsum("sx,sx->s", slave.x - feet.x, feet.normal)
-    # stencil of each row: the slave node and the nodes of the master facet
-    node = np.column_stack([slave.number, feet.node])
-    weight = np.column_stack([-np.ones(s), feet.N])
-    B = rows_along(node, weight, feet.normal, u.size)
-    # friction rows have the weights of their contact row, along the tangents
-    along = tangents(feet.normal)[: s if tangential else 0]
-    row, every = np.repeat(np.arange(len(along)), dim - 1), np.arange(s)
-    T = rows_along(node[row], weight[row], along.reshape(-1, dim), u.size)
-    rows = ContactRows(B, gap + B @ u, T, row, slave.areas, every, np.ones(s), every)
-    if feet.beyond.any():
-        radius = np.minimum(side().radius, feet.radius)
-        outside = feet.beyond > EXTENSION * radius
-        if outside.any():
-            return _with_integrals(rows, side(), outside, integral)
-    return rows
-
-
-def _with_integrals(
+def with_integrals(
     nodal: ContactRows,
     side: Surface,
     outside: NDArray[np.bool_],
@@ -186,6 +126,8 @@ def _with_integrals(
     ----------
     nodal : rows of all slave nodes
     outside : (s,) mask of the nodes beyond the border
+    integral : function that returns the mortar rows, with the basis N_j, of the slave
+        facets in a mask `part` (f,)
 
     """
     s, areas = nodal.c.size, side.areas
@@ -305,6 +247,46 @@ def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr
     B.sum_duplicates()
     B.eliminate_zeros()
     return B
+
+
+def side_matrix(
+    blocks: NDArray[np.float64], rows: Nodes, nodes: Nodes, shape: tuple[int, int]
+) -> csr_array:
+    """Sum blocks (p, a, c, dim) at rows (p, a) and nodes (p, c) into a matrix.
+
+    shape : numbers of rows and of nodes; each node has dim columns
+    """
+    dim = blocks.shape[-1]
+    row = np.broadcast_to(rows[:, :, None, None], blocks.shape)
+    column = np.broadcast_to(
+        dim * nodes[:, None, :, None] + np.arange(dim), blocks.shape
+    )
+    at = row.ravel(), column.ravel()
+    return csr_array(coo_array((blocks.ravel(), at), (shape[0], dim * shape[1])))
+
+
+def mortar_rows(
+    D: csr_array, M: csr_array, cover: Vector, sides: tuple[Nodes, Nodes], n: int
+) -> csr_array:
+    """Return the rows (m, n) of u ↦ (D u_s − M u_m)_j / cover_j for j with cover_j > 0.
+
+    D, M : (s, dim·s) and (s, dim·v), from `side_matrix`
+    sides : numbers of the slave nodes (s,) and of the master nodes (v,)
+    """
+    j, dim = np.flatnonzero(cover), D.shape[1] // max(D.shape[0], 1)
+    left, right = D[j].tocoo(), M[j].tocoo()
+    row = np.concatenate([left.row, right.row])
+    slave, master = (dofs_of(side, dim) for side in sides)
+    column = np.concatenate([slave[left.col], master[right.col]])
+    values = np.concatenate([left.data, -right.data]) / cover[j][row]
+    B = csr_array(coo_array((values, (row, column)), (len(j), n)))
+    B.eliminate_zeros()
+    return B
+
+
+def gathered(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
+    """Sum values (p, a) at nodes (p, a) into a vector (count,)."""
+    return np.bincount(nodes.ravel(), values.ravel(), minlength=count).astype(float)
 
 
 def joined(

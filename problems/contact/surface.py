@@ -100,6 +100,29 @@ class Surface:
         return float(np.linalg.norm(np.ptp(self.x, axis=0)))
 
 
+@dataclass(frozen=True)
+class Reach:
+    """Limits on the angle between the normals, and on the distance, of two sides."""
+
+    #: largest n_s·n_m of the normals of slave and master; −½ admits normals that are at
+    #: most 60° from opposite
+    cosine: float = -0.5
+    #: largest distance, m; None selects the larger extent of the two sides
+    distance: float | None = None
+
+    def __post_init__(self) -> None:
+        if not -1 <= self.cosine <= 1:
+            raise InputError(f"reach: cosine={self.cosine} must be in [-1, 1]")
+        if self.distance is not None and not self.distance > 0:
+            raise InputError(f"reach: distance={self.distance} m must be positive")
+
+    def max_distance(self, slave: Surface, master: Surface) -> float:
+        """Return the largest distance allowed between two sides, m."""
+        if self.distance is not None:
+            return self.distance
+        return max(slave.extent, master.extent)
+
+
 def current_surface(points: Points, u: Vector, side: Nodes, name: str) -> Surface:
     """Return the surface of a side at X + u.
 

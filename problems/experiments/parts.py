@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Value
 from mortarbench.problems.contact.mortar import mortar
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.experiments.clock import Laps, Stopwatch, race, timed_as_one
 from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.fem.elasticity import (
@@ -78,7 +78,7 @@ def contact(plan: Plan) -> Rows:
             (pair,) = bodies.pairs
             points, u = bodies.mesh.points, np.zeros(bodies.mesh.dofs)
             contestants = {
-                "nts": timed_as_one(partial(node_to_segment, points, u, *pair.sides)),
+                "nts": timed_as_one(partial(node_to_facet, points, u, *pair.sides)),
                 "mortar": timed_as_one(partial(mortar, points, u, *pair.sides)),
             }
             size = {"master": len(pair.master) - 1, "slave": len(pair.slave) - 1}

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.problems.contact import node_to_segment as contact
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact import closest as contact
+from mortarbench.problems.contact.closest import divided
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.rows import rows_along
 from mortarbench.problems.contact.surface import surface
 
@@ -23,11 +24,11 @@ def rows(slave, master, u=None):
     n = len(slave)
     u = np.zeros(points.size) if u is None else u
     chains = np.arange(n), np.arange(n, len(points))
-    return node_to_segment(points, u, *chains)
+    return node_to_facet(points, u, *chains)
 
 
 def closest_points(x, chain):
-    return contact.closest_points(x, surface(chain, "master"))
+    return contact.closest_points(x, divided(surface(chain, "master")))
 
 
 def test_a_node_above_a_segment_may_descend_by_its_gap():
@@ -57,15 +58,15 @@ def test_at_a_vertex_the_normal_is_averaged_and_the_vertex_carries_the_force():
 def test_a_node_next_to_a_vertex_is_on_it(aside):
     at = closest_points(np.array([[1.0 + aside, 1.0 - abs(aside)]]), ROOF)
 
-    assert at.xi[0] in (0, 1)
+    assert at.N[0, 1] in (0, 1)
     assert at.normal == pytest.approx(np.array([[0, 1]]))
 
 
 def test_beyond_the_end_of_the_chain_the_last_node_is_the_closest_point():
     at = closest_points(np.array([[-3.0, 1.0], [5.0, 1.0]]), MASTER)
 
-    assert at.segment.tolist() == [1, 0]
-    assert at.xi.tolist() == [1, 0]
+    assert at.facet.tolist() == [1, 0]
+    assert at.N[:, 1].tolist() == [1, 0]
     assert at.normal == pytest.approx(np.array([[0, 1], [0, 1]]))
 
 
@@ -95,7 +96,7 @@ def test_rows_are_invariant_under_translations_and_forces_balance(seed):
     B, *_ = rows(slave, master, u)
     x = np.concatenate([slave, master]) + u.reshape(-1, 2)
     at = closest_points(x[:12], x[12:])
-    inside = (at.xi > 0) & (at.xi < 1)
+    inside = (at.N[:, 0] > 0) & (at.N[:, 1] > 0)
 
     forces = B.toarray().reshape(12, -1, 2)
     moment = np.einsum("rn,n->r", forces[..., 1], x[:, 0])
@@ -111,10 +112,8 @@ def test_the_linearised_gap_is_exact_to_first_order():
     master = np.column_stack([np.linspace(4, 0, 5), [0.0, 0.05, 0.1, 0.05, 0.0]])
     slave = np.array([[0.7, 0.075 + 1e-9], [2.6, 0.07 + 1e-9]])  # nearly touching
     foot = closest_points(slave, master)
-    N = np.column_stack([1 - foot.xi, foot.xi])
-    start = np.einsum(
-        "sa,sax->sx", N, master[np.column_stack([foot.segment, foot.segment + 1])]
-    )
+    ends = master[np.column_stack([foot.facet, foot.facet + 1])]
+    start = np.einsum("sa,sax->sx", foot.N, ends)
     slave = start + 1e-9 * foot.normal
     B, c, *_ = rows(slave, master)
     direction = rng.standard_normal(14)
@@ -149,8 +148,8 @@ def test_a_node_on_an_end_of_the_master_has_the_normal_of_the_last_segment():
 def test_a_master_of_one_segment_has_an_inside_and_two_ends():
     at = closest_points(np.array([[3.0, 1.0], [-1.0, 0.0], [9.0, 0.5]]), MASTER[::2])
 
-    assert at.segment.tolist() == [0, 0, 0]
-    assert at.xi.tolist() == [0.25, 1, 0]
+    assert at.facet.tolist() == [0, 0, 0]
+    assert at.N[:, 1].tolist() == [0.25, 1, 0]
     assert at.normal == pytest.approx(np.array([[0, 1]] * 3))
 
 
@@ -192,7 +191,7 @@ def test_a_slave_node_at_infinity_is_refused():
 def test_a_node_that_is_also_on_the_master_has_one_entry_per_component():
     """In self-contact, the closest point of a node on the master is the node itself."""
     points = np.concatenate([MASTER, [[1.0, 0.25]]])
-    B, c, *_ = node_to_segment(points, np.zeros(8), np.array([1, 3]), np.arange(3))
+    B, c, *_ = node_to_facet(points, np.zeros(8), np.array([1, 3]), np.arange(3))
 
     assert B.has_canonical_format
     assert B.toarray() == pytest.approx(

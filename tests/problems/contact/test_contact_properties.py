@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from mortarbench.problems.contact.closest import closest_points, divided
 from mortarbench.problems.contact.mortar import _dual, cast_rays, mortar, overlaps
-from mortarbench.problems.contact.node_to_segment import closest_points, node_to_segment
-from mortarbench.problems.contact.segment_search import Reach
-from mortarbench.problems.contact.surface import surface
+from mortarbench.problems.contact.node_to_facet import node_to_facet
+from mortarbench.problems.contact.surface import Reach, surface
 
 
 def searched(**drawn):
@@ -46,7 +46,7 @@ def sides(draw):
 
 
 METHODS = {
-    "segment": node_to_segment,
+    "segment": node_to_facet,
     "dual": mortar,
     "standard": lambda *side: mortar(*side, basis="standard"),
 }
@@ -67,8 +67,8 @@ def test_rows_are_invariant_under_translations(side):
 def inside_segments(rows, x, slave, master):
     """Return a mask of the rows whose node is opposite the inside of a segment, and
     whose facets do not extend beyond the master."""
-    at = closest_points(x[slave], surface(x[master], "master"))
-    inside = (at.xi > 0) & (at.xi < 1)
+    at = closest_points(x[slave], divided(surface(x[master], "master")))
+    inside = (at.N > 0).all(axis=1)
     outside = np.pad(at.beyond > 0, 1)
     inside &= ~(outside[:-2] | outside[2:])
     return inside[rows.place]
@@ -77,7 +77,7 @@ def inside_segments(rows, x, slave, master):
 @searched(side=sides())
 def test_forces_of_a_node_inside_a_segment_have_no_moment(side):
     points, u, slave, master = side
-    rows = node_to_segment(*side)
+    rows = node_to_facet(*side)
     x = points + u.reshape(-1, 2)
     inside = inside_segments(rows, x, slave, master)
 
@@ -146,7 +146,7 @@ def test_rows_at_the_ends_of_a_straight_master_have_no_moment(side):
     points, _, slave, master = side
     x = points.copy()
     x[:, 1] = 0.1 * (np.arange(len(x)) < slave.size)
-    rows = node_to_segment(x, np.zeros(x.size), slave, master)
+    rows = node_to_facet(x, np.zeros(x.size), slave, master)
     low = np.maximum(x[slave, 0].min(), x[master, 0].min())
     high = np.minimum(x[slave, 0].max(), x[master, 0].max())
     forces = rows.B.toarray().reshape(rows.c.size, -1, 2)
@@ -164,7 +164,7 @@ def test_the_gap_is_the_slack_of_the_row_at_the_linearisation_point(side):
     """Where the closest point is inside a segment, |c − B u| is the distance to the
     master."""
     points, u, slave, master = side
-    rows = node_to_segment(*side)
+    rows = node_to_facet(*side)
     x = points + u.reshape(-1, 2)
     inside = inside_segments(rows, x, slave, master)
 

@@ -7,15 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mortarbench.harness import InputError
-from mortarbench.problems.contact.segment_search import Reach
-from mortarbench.problems.contact.space.face_mortar import (
+from mortarbench.problems.contact.closest import divided
+from mortarbench.problems.contact.face_mortar import (
     clip,
     face_mortar,
     moments,
     overlaps,
 )
-from mortarbench.problems.contact.space.triangles import triangulated
-from mortarbench.problems.contact.surface import current_surface
+from mortarbench.problems.contact.surface import Reach, current_surface
 
 
 def exact_overlap(subject, window):
@@ -247,7 +246,7 @@ def test_the_overlaps_cover_the_common_part_exactly_once(rng):
         grid((17, 23), 0.0, kind="triangle", up=False, distort=0.2, rng=rng),
     )
     parts = [
-        triangulated(current_surface(points, np.zeros(points.size), f, "side"))
+        divided(current_surface(points, np.zeros(points.size), f, "side"))
         for f in (slave, master)
     ]
     at = overlaps(*parts, Reach())
@@ -266,10 +265,10 @@ def test_faces_are_searched_independently_of_each_other():
     upper = np.unique(slave)
     points[upper, 2] += 0.8 * points[upper, 0] ** 3
     u = np.zeros(points.size)
-    other = triangulated(current_surface(points, u, master, "master"))
+    other = divided(current_surface(points, u, master, "master"))
 
     def found(faces):
-        own = triangulated(current_surface(points, u, faces, "slave"))
+        own = divided(current_surface(points, u, faces, "slave"))
         return overlaps(own, other, Reach()).area.sum()
 
     alone = [found(slave[[k]]) for k in range(len(slave))]

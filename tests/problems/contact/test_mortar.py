@@ -12,8 +12,7 @@ from mortarbench.problems.contact.mortar import (
     overlaps,
     project,
 )
-from mortarbench.problems.contact.segment_search import Reach
-from mortarbench.problems.contact.surface import surface
+from mortarbench.problems.contact.surface import Reach, surface
 from mortarbench.problems.models.beam_ring import model
 
 BASES = ["dual", "standard"]

@@ -4,20 +4,19 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mortarbench.problems.contact.node_to_segment import node_to_segment
-from mortarbench.problems.contact.space.node_to_face import node_to_face
-from mortarbench.problems.contact.space.triangles import (
-    closest_in_triangles,
+from mortarbench.problems.contact.closest import (
+    closest_in_simplices,
     closest_points,
-    triangulated,
+    divided,
 )
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.surface import faceted_surface
 
 
 def test_closest_points_of_triangles_are_those_of_a_fine_search(rng):
     triangle = rng.standard_normal((60, 3, 3))
     x = 2 * rng.standard_normal((60, 3))
-    at = np.einsum("pv,pvx->px", closest_in_triangles(x, triangle), triangle)
+    at = np.einsum("pv,pvx->px", closest_in_simplices(x, triangle), triangle)
     distance = np.linalg.norm(x - at, axis=1)
     a, b = np.meshgrid(*[np.linspace(0, 1, 101)] * 2)
     inside = a + b <= 1
@@ -49,7 +48,7 @@ def test_rows_of_extruded_sides_are_those_of_the_plane(tangential, rng):
     upper = np.stack([s, 0.12 * np.sin(3 * s) + 0.02], axis=-1)  # its body above
     flat = np.concatenate([upper, lower])
     u = 0.003 * rng.standard_normal(flat.shape)
-    plane = node_to_segment(
+    plane = node_to_facet(
         flat, u.ravel(), np.arange(9), 9 + np.arange(7), tangential=tangential
     )
 
@@ -57,7 +56,7 @@ def test_rows_of_extruded_sides_are_those_of_the_plane(tangential, rng):
     parts = [extruded(chain + shift, layers, 0.5)
              for chain, shift in ((upper, u[:9]), (lower, u[9:]))]  # fmt: skip
     points = np.concatenate([part[0] for part in parts])
-    rows = node_to_face(
+    rows = node_to_facet(
         points, np.zeros(points.size), parts[0][1], parts[1][1] + 9 * layers,
         tangential=tangential,
     )  # fmt: skip
@@ -90,13 +89,13 @@ def test_the_closest_face_is_that_of_an_exhaustive_search(rng):
     i = np.arange(n * n).reshape(n, n)
     corners = (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1])
     table = np.stack([c.ravel() for c in corners], axis=-1)
-    faces = triangulated(faceted_surface(points, table, "master"))
+    faces = divided(faceted_surface(points, table, "master"))
     x = rng.uniform([-0.5, -0.5, -1], [1.5, 1.5, 2], (200, 3))
     closest = closest_points(x, faces)
-    at = np.einsum("sc,scx->sx", closest.N, points[table[closest.face]])
+    at = np.einsum("sc,scx->sx", closest.N, points[table[closest.facet]])
     for one, foot in zip(x, at, strict=True):
-        every = closest_in_triangles(
-            np.broadcast_to(one, (len(faces.face), 3)), faces.vertices
+        every = closest_in_simplices(
+            np.broadcast_to(one, (len(faces.facet), 3)), faces.vertices
         )
         distance = np.linalg.norm(
             np.einsum("tv,tvx->tx", every, faces.vertices) - one, axis=1
@@ -109,7 +108,7 @@ def test_rows_have_no_resultant_and_no_moment_inside_of_flat_faces():
     above = np.array([[0.3, 0.2, 0.1], [0.8, 0.2, 0.2], [0.6, 0.9, 0.3]])
     slave = len(points) + np.array([[0, 2, 1, 1]])
     every = np.concatenate([points, above])
-    rows = node_to_face(every, np.zeros(every.size), slave, faces)
+    rows = node_to_facet(every, np.zeros(every.size), slave, faces)
     assert_allclose(rows.c, [0.1, 0.2, 0.3])
     for row in rows.B.toarray():
         force = row.reshape(-1, 3)

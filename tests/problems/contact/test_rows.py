@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.rows import (
     handed_over,
     joined,
     rows_along,
     without_fixed,
 )
-from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.fem.mesh import box, nodal_lengths
 
 MASTER = np.array([[2.0, 0.0], [1.5, 0.0], [0.7, 0.0], [0.0, 0.0]])
@@ -20,7 +19,7 @@ def over(slave, gap=0.1):
     """Return rows of slave nodes at x = `slave` above the MASTER, and the nodes."""
     nodes = np.column_stack([slave, np.full(len(slave), gap)])
     points, s = np.concatenate([nodes, MASTER]), len(slave)
-    rows = node_to_segment(
+    rows = node_to_facet(
         points, np.zeros(points.size), np.arange(s), s + np.arange(4), tangential=True
     )
     return rows, points
@@ -74,7 +73,7 @@ def test_faces_have_rows_only_where_the_master_is(shift):
     above = box((*shift, 0.05), (1.6, 1.2, 1.0), (4, 3, 1))
     points = np.vstack([above.points, below.points])
     master = below.boundaries["top"] + len(above.points)
-    rows = node_to_face(
+    rows = node_to_facet(
         points, np.zeros(points.size), above.boundaries["bottom"], master
     )
     common = [
@@ -95,7 +94,7 @@ def test_equal_rows_of_a_common_node_become_one_and_divide_its_force():
     x = np.array([0.1, 0.5, 0.9, 1.7])
     points = np.concatenate([np.column_stack([x, 0 * x]), MASTER])
     master, sides = 4 + np.arange(4), (np.array([0, 1, 2]), np.array([2, 3]))
-    parts = [node_to_segment(points, np.zeros(16), side, master) for side in sides]
+    parts = [node_to_facet(points, np.zeros(16), side, master) for side in sides]
     rows = joined(parts, sides, 2.0)
     forces = rows.at_places(np.array([1.0, 2.0, 6.0, 4.0]), 5)
 

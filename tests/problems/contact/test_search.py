@@ -1,12 +1,12 @@
-"""Closest-point search: comparison with all pairs, and number of visited chords."""
+"""Closest points of chains and facing segments, compared with all pairs."""
 
 import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.problems.contact import segment_search as search
-from mortarbench.problems.contact.segment_search import Reach, facing_segments, nearest
-from mortarbench.problems.contact.surface import surface
+from mortarbench.problems.contact.closest import closest_points, divided
+from mortarbench.problems.contact.mortar import facing_segments
+from mortarbench.problems.contact.surface import Reach, surface
 
 
 def all_pairs(x, chain):
@@ -15,6 +15,10 @@ def all_pairs(x, chain):
     offset = x[:, None] - chain[:-1]
     xi = np.einsum("sex,ex->se", offset, edge) / (edge**2).sum(axis=1)
     return np.linalg.norm(offset - np.clip(xi, 0, 1)[..., None] * edge, axis=-1)
+
+
+def nearest(x, chain):
+    return closest_points(x, divided(surface(chain, "master")))
 
 
 def arc(n, radius=0.49, centre=(1.0, 0.0)):
@@ -36,11 +40,11 @@ def test_the_closest_segment_of_the_whole_chain_is_found(segments, roughness):
     rng = np.random.default_rng(577215)
     chain = arc(segments) + roughness * rng.standard_normal((segments + 1, 2))
     x = rng.uniform(-1, 3, (200, 2))
-    closest = nearest(x, surface(chain, "master"))
+    closest = nearest(x, chain)
     distance = all_pairs(x, chain)
 
-    start, edge = chain[closest.segment], np.diff(chain, axis=0)[closest.segment]
-    reached = np.linalg.norm(x - start - closest.xi[:, None] * edge, axis=1)
+    start, edge = chain[closest.facet], np.diff(chain, axis=0)[closest.facet]
+    reached = np.linalg.norm(x - start - closest.N[:, 1:] * edge, axis=1)
     assert reached == pytest.approx(distance.min(axis=1), rel=1e-12)
 
 
@@ -49,46 +53,28 @@ def test_the_closest_segment_is_found_on_a_chain_that_returns_to_its_start():
     circle = np.column_stack([np.cos(theta), np.sin(theta)])
     circle[-1] = circle[0]
     x = np.random.default_rng(141421).uniform(-2, 2, (100, 2))
-    closest = nearest(x, surface(circle, "master"))
+    closest = nearest(x, circle)
 
     distance = all_pairs(x, circle)
-    assert np.take_along_axis(distance, closest.segment[:, None], 1)[:, 0] == (
+    assert np.take_along_axis(distance, closest.facet[:, None], 1)[:, 0] == (
         pytest.approx(distance.min(axis=1), rel=1e-12)
     )
 
 
 def test_the_closest_segment_is_found_on_a_chain_with_loops():
-    """Sub-chains of four segments are closed, so that their chords have length zero."""
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     loops = np.concatenate([np.tile(square, (5, 1)), square[:1]])
-    closest = nearest(np.array([[0.5, -1], [2, 0.5], [0.5, 0.9]]), surface(loops, "m"))
+    closest = nearest(np.array([[0.5, -1], [2, 0.5], [0.5, 0.9]]), loops)
 
-    assert closest.segment.tolist() == [0, 1, 2]
+    assert closest.facet.tolist() == [0, 1, 2]
 
 
 def test_of_two_equally_close_segments_the_first_along_the_chain_is_taken():
     down = np.column_stack([np.zeros(65), np.arange(64, -1, -1.0)])
     corner = np.concatenate([down, down[-2::-1, ::-1]])  # (0, 64) → origin → (64, 0)
-    closest = nearest(np.array([[20.5, 20.5]]), surface(corner, "master"))
+    closest = nearest(np.array([[20.5, 20.5]]), corner)
 
-    assert (closest.segment.tolist(), closest.xi.tolist()) == ([43], [0.5])
-
-
-@pytest.mark.parametrize("segments", [500, 2000])
-def test_far_queries_visit_few_chords_each(segments, monkeypatch):
-    """The feet of the ring are 0.4 m to 0.5 m from a beam with segments of 4 mm or
-    1 mm."""
-    visited = []
-    distances = search._to_chords
-
-    def counted(x, level, node):
-        visited.append(len(node))
-        return distances(x, level, node)
-
-    monkeypatch.setattr(search, "_to_chords", counted)
-    nearest(arc(segments), surface(bent_beam(segments), "master"))
-
-    assert sum(visited) <= 60 * segments
+    assert (closest.facet.tolist(), closest.N.tolist()) == ([43], [[0.5, 0.5]])
 
 
 @pytest.mark.parametrize("segments", SIZES)

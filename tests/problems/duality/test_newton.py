@@ -8,9 +8,9 @@ import pytest
 from scipy.sparse import csr_array, eye_array
 
 from mortarbench.harness import InputError
-from mortarbench.problems.contact.node_to_segment import (
+from mortarbench.problems.contact.node_to_facet import (
     geometric_stiffness,
-    node_to_segment,
+    node_to_facet,
 )
 from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality import newton
@@ -64,7 +64,7 @@ def test_the_geometric_stiffness_is_the_derivative_of_the_contact_forces():
     multipliers, h = np.array([1.0, 2.0, 3.0]), 1e-6
 
     def force(u):
-        return node_to_segment(points, u, slave, master).B.T @ multipliers
+        return node_to_facet(points, u, slave, master).B.T @ multipliers
 
     blocks, components = geometric_stiffness(points, u, slave, master, multipliers)
     whole = np.zeros((14, 14))

@@ -10,7 +10,7 @@ from mortarbench.harness.suite.suite import load_suite
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
 from mortarbench.problems.families.beam_ring import BeamRing
@@ -129,7 +129,7 @@ def test_recovery_yields_a_primal_solution_with_all_multipliers(
 ):
     bodies = model(4, 3, 6, "strain")
     slave, master, *_ = bodies.pairs[0]
-    rows = node_to_segment(bodies.mesh.points, np.zeros(848), slave, master)
+    rows = node_to_facet(bodies.mesh.points, np.zeros(848), slave, master)
     primal = primal_qp(bodies, rows)
     way = dualise if transform == "dual" else dual_bounds
     inverse = (

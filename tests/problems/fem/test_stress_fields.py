@@ -10,7 +10,7 @@ from mortarbench.problems.contact.bodies import (
     factorise_floating,
     factorise_supported,
 )
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.results import fields, nodal_stresses
 from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
@@ -73,7 +73,7 @@ def test_fields_carry_the_stresses_of_the_dimensional_displacement():
     bodies = model(2, 2, 4, "strain")
     u = stretched(bodies)
     slave, master, *_ = bodies.pairs[0]
-    rows = node_to_segment(bodies.mesh.points, u, slave, master)
+    rows = node_to_facet(bodies.mesh.points, u, slave, master)
     primal = primal_qp(bodies, rows)
     s = Solution(
         status=Status.SOLVED, x=u / bodies.length, y=0 * primal.b, z=0 * primal.h,

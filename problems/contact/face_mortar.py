@@ -43,15 +43,24 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, vstack
+from scipy.sparse import csr_array, vstack
 from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
+from mortarbench.problems.contact.closest import Simplices, divided
 from mortarbench.problems.contact.mortar import Basis
-from mortarbench.problems.contact.rows import ContactRows
-from mortarbench.problems.contact.segment_search import Reach
-from mortarbench.problems.contact.space.triangles import FaceTriangles, triangulated
-from mortarbench.problems.contact.surface import Points, current_surface, tangents
+from mortarbench.problems.contact.rows import (
+    ContactRows,
+    gathered,
+    mortar_rows,
+    side_matrix,
+)
+from mortarbench.problems.contact.surface import (
+    Points,
+    Reach,
+    current_surface,
+    tangents,
+)
 from mortarbench.problems.fem.mesh import Nodes
 
 #: overlaps whose area is at most this factor times the squared radius of the slave face
@@ -129,28 +138,25 @@ def face_mortar(
         for side, name in ((slave, "slave"), (master, "master"))
     )
     nodes = np.unique(slave), np.unique(master)
-    own, other = triangulated(s), triangulated(m)
-    at = overlaps(own if part is None else triangulated(s.part(part)), other, reach)
+    own, other = divided(s), divided(m)
+    at = overlaps(own if part is None else divided(s.part(part)), other, reach)
     A = _dual(at) if basis == "dual" else np.eye(4)  # Φ = A N
     at = at if part is None else at._replace(slave=np.flatnonzero(part)[at.slave])
     j, k = s.facets[at.slave], m.facets[at.master]
-    cover = _gather(at.area, j, len(s.x))
-    gap = _gather((A @ at.gap[..., None])[..., 0], j, len(s.x))
+    cover = gathered(at.area, j, len(s.x))
+    gap = gathered((A @ at.gap[..., None])[..., 0], j, len(s.x))
     active = np.flatnonzero(cover)
     D, M = A @ at.own, A @ at.other
     normal = np.broadcast_to(s.normal[at.slave][:, None], (*j.shape, 3))
 
     def rows(direction: Points) -> csr_array:
         """Return rows along directions (p, 4, 3) of the slave nodes of each overlap."""
-        entries = [
-            _entries(values, direction, j, numbers[columns])
-            for values, columns, numbers in ((D, j, nodes[0]), (-M, k, nodes[1]))
-        ]
-        value, row, column = map(np.concatenate, zip(*entries, strict=True))
-        shape = (len(s.x), points.size)
-        B = csr_array(coo_array((value / cover[row], (row, column)), shape))[active]
-        B.eliminate_zeros()
-        return B
+        blocks = (values[..., None] * direction[:, :, None] for values in (D, M))
+        left, right = (
+            side_matrix(block, j, at, (len(s.x), side.size))
+            for block, at, side in zip(blocks, (j, k), nodes, strict=True)
+        )
+        return mortar_rows(left, right, cover, nodes, points.size)
 
     B = rows(normal)
     T, row = csr_array((0, points.size)), np.arange(0)
@@ -173,16 +179,16 @@ def face_mortar(
     )
 
 
-def _integrals_of(side: FaceTriangles) -> Vector:
+def _integrals_of(side: Simplices) -> Vector:
     """Return ∫N_j (v,) over the faces, projected onto their auxiliary planes."""
     a, b = (side.vertices[:, k] - side.vertices[:, 0] for k in (1, 2))
-    area = np.einsum("tx,tx->t", np.cross(a, b), side.surface.normal[side.face]) / 2
+    area = np.einsum("tx,tx->t", np.cross(a, b), side.surface.normal[side.facet]) / 2
     integrals = area[:, None] * side.shape.mean(axis=1)
-    nodes = side.surface.facets[side.face]
-    return _gather(integrals, nodes, len(side.surface.x))
+    nodes = side.surface.facets[side.facet]
+    return gathered(integrals, nodes, len(side.surface.x))
 
 
-def overlaps(slave: FaceTriangles, master: FaceTriangles, reach: Reach) -> Overlaps:
+def overlaps(slave: Simplices, master: Simplices, reach: Reach) -> Overlaps:
     """Clip the triangles of both sides on the auxiliary planes of the slave faces."""
     e, m = _facing(slave, master, reach)
     step = CHUNK // (slave.number.max() * master.number.max())
@@ -193,9 +199,7 @@ def overlaps(slave: FaceTriangles, master: FaceTriangles, reach: Reach) -> Overl
     return Overlaps(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def _facing(
-    slave: FaceTriangles, master: FaceTriangles, reach: Reach
-) -> tuple[Nodes, Nodes]:
+def _facing(slave: Simplices, master: Simplices, reach: Reach) -> tuple[Nodes, Nodes]:
     """Return pairs of faces (k,) that a ray along a slave normal may connect.
 
     From the centre of each slave face, in both directions along its normal, a point is
@@ -204,7 +208,7 @@ def _facing(
     """
     tree = KDTree(master.centre)
     near = slave.radius + master.radius.max()
-    limit = _max_distance(slave, master, reach) + near
+    limit = reach.max_distance(slave.surface, master.surface) + near
     e: list[Nodes] = []
     m: list[Nodes] = [np.zeros(0, dtype=np.int64)]
     for sign in (1.0, -1.0):
@@ -234,19 +238,12 @@ def _facing(
     return pairs[0, used], pairs[1, used]
 
 
-def _max_distance(slave: FaceTriangles, master: FaceTriangles, reach: Reach) -> float:
-    """Return the largest gap within reach, m."""
-    if reach.distance is not None:
-        return reach.distance
-    return max(slave.surface.extent, master.surface.extent)
-
-
 def _integrals(
-    slave: FaceTriangles, master: FaceTriangles, e: Nodes, m: Nodes, reach: Reach
+    slave: Simplices, master: Simplices, e: Nodes, m: Nodes, reach: Reach
 ) -> Overlaps:
     """Return the integrals over the overlaps of pairs of faces e, m (k,)."""
-    t_s, pair = slave.of_faces(e)
-    t_m, place = master.of_faces(m[pair])
+    t_s, pair = slave.of_facets(e)
+    t_m, place = master.of_facets(m[pair])
     # pair all triangles of the slave face with all triangles of the master face
     t_s, pair = t_s[place], pair[place]
     # coordinates in the auxiliary plane, and height above it
@@ -275,7 +272,8 @@ def _integrals(
     area = moment[:, 0, 0]
     least = MIN_OVERLAP * slave.radius[e[pair]] ** 2
     mean_gap = np.einsum("pa,pa->p", moment[:, 0], g) / np.where(area > 0, area, 1)
-    used = (area > least) & (np.abs(mean_gap) <= _max_distance(slave, master, reach))
+    distance = reach.max_distance(slave.surface, master.surface)
+    used = (area > least) & (np.abs(mean_gap) <= distance)
     pairs, place = np.unique(pair[used], return_inverse=True)
 
     def summed(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -386,18 +384,3 @@ def _dual(at: Overlaps) -> NDArray[np.float64]:
     np.add.at(D_e, place, at.area)
     inverse = np.linalg.pinv(M_e, rcond=SINGULAR, hermitian=True)
     return np.asarray((D_e[..., None] * inverse)[place])
-
-
-def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
-    """Sum values (p, 4) at nodes (p, 4) into a vector (count,)."""
-    return np.bincount(nodes.ravel(), values.ravel(), minlength=count).astype(float)
-
-
-def _entries(
-    values: NDArray[np.float64], direction: Points, rows: Nodes, nodes: Nodes
-) -> tuple[Vector, Nodes, Nodes]:
-    """Return values, rows and columns of blocks (p, 4, 4) along vectors (p, 4, 3)."""
-    block = values[..., None] * direction[:, :, None]  # (p, 4, 4, 3)
-    row = np.broadcast_to(rows[:, :, None, None], block.shape)
-    column = np.broadcast_to((3 * nodes[:, None, :, None] + np.arange(3)), block.shape)
-    return block.ravel(), row.ravel(), column.ravel()

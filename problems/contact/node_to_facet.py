@@ -1,4 +1,4 @@
-"""Node-to-segment non-penetration, linearised at a given displacement.
+"""Node-to-segment (3D: node-to-face) non-penetration, linearised at a displacement.
 
 Each slave node must stay on the outer side of the master boundary. With its closest
 point x_c = Σ N_a x_a on the master in the current configuration x = X + u^k and the
@@ -9,11 +9,13 @@ order in the total displacement u, with N_a and n fixed at u^k,
 
 This is the paper's B_M u ≤ c_M (Section 2). The paper calls the method "Mortar", but
 the condition is pointwise and fails the contact patch test; the method of
-`problems.contact.mortar` passes this test. The normal n is that of the segment that
-contains the closest point, or at a vertex the averaged normal of the two segments. If
-the closest point is inside a segment, x_s − x_c ∥ n, and the forces Bᵀλ have no moment.
+`problems.contact.mortar` passes this test. The normal n is that of the facet that
+contains the closest point or, where several facets meet there, their averaged normal.
+If the closest point is inside a facet, x_s − x_c ∥ n, and the forces Bᵀλ have no
+moment.
 
-Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
+Friction acts along the tangent t = (−n_y, n_x), or in 3D along two tangents, on the
+tangential motion
 
     T u,    T = [−t at s, +N_a t at a].
 
@@ -36,31 +38,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
+from mortarbench.problems.contact.closest import (
+    SAME_POINT,
+    ClosestPoints,
+    Simplices,
+    closest_points,
+    divided,
+    projected,
+)
+from mortarbench.problems.contact.face_mortar import face_mortar
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.rows import (
+    EXTENSION,
     ContactRows,
-    Feet,
-    SlaveNodes,
-    nodal_rows,
-)
-from mortarbench.problems.contact.segment_search import (
-    ClosestPoints,
-    along_lines,
-    closest_points,
+    rows_along,
+    with_integrals,
 )
 from mortarbench.problems.contact.surface import (
     Points,
-    Surface,
     current_positions,
     current_surface,
-    surface,
     tangents,
 )
 from mortarbench.problems.fem.elements import cross
-from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
+from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths, nodes_of_side
 
 
-def node_to_segment(
+def node_to_facet(
     points: Points,
     u: Vector,
     slave: Nodes,
@@ -71,42 +75,57 @@ def node_to_segment(
 ) -> ContactRows:
     """Linearise the non-penetration condition of all slave nodes at u.
 
-    The result has one contact row per slave node, except for nodes beyond an end of the
-    master. B, c and T are defined in the module docstring.
+    The result has one contact row per slave node, except for nodes beyond the border of
+    the master. B, c and T are defined in the module docstring.
 
     Parameters
     ----------
     points : (N, dim) reference positions X, m
     u : (n,) displacement u^k at which to linearise, m
-    slave : (s,) chain of nodes with its body on the left
-    master : (v,) chain of nodes with its body on the left
-    tangential : add tangential rows for friction
-    fixed_segments : (s,) fixed segment of each slave node, given by the position of its
-        first node in the master chain; −1 selects the closest segment
+    slave, master : sides, which are boundaries of a `Mesh`
+    tangential : add dim − 1 tangential rows per contact row for friction
+    fixed_segments : (s,) fixed segment of each slave node (2D), numbered as in
+        `Surface.facets`; −1 selects the closest segment
 
     Raises
     ------
     InputError
-        If a position is not finite or the master has no segment of positive length.
+        If a position is not finite, the master has no segment of positive length, or a
+        face has no area.
 
     """
-    x = current_positions(points, u, slave, "slave")
-    line = current_surface(points, u, master, "master")
-    closest = _projections(x, line, fixed_segments)
-    N = np.stack([1 - closest.xi, closest.xi], axis=1)
-    ends = np.stack([closest.segment, closest.segment + 1], axis=1)
-    foot = np.einsum("sa,sax->sx", N, line.x[ends])
-    radius = line.radius[closest.segment]
-    return nodal_rows(
-        u,
-        SlaveNodes(slave, x, nodal_lengths(x)),
-        Feet(master[ends], N, foot, closest.normal, closest.beyond, radius),
-        lambda: surface(x, "slave"),
-        partial(
-            mortar, points, u, slave, master, basis="standard", tangential=tangential
-        ),
-        tangential=tangential,
+    dim, own = points.shape[1], nodes_of_side(slave)
+    x = current_positions(points, u, own, "slave")
+    side = divided(current_surface(points, u, master, "master"))
+    closest = _projections(x, side, fixed_segments)
+    corners = side.surface.facets[closest.facet]
+    foot = np.einsum("sa,sax->sx", closest.N, side.surface.x[corners])
+    gap = np.einsum("sx,sx->s", x - foot, closest.normal)
+    # stencil of each row: the slave node and the nodes of the master facet
+    node = np.column_stack([own, nodes_of_side(master)[corners]])
+    weight = np.column_stack([-np.ones(own.size), closest.N])
+    B = rows_along(node, weight, closest.normal, u.size)
+    # friction rows have the weights of their contact row, along the tangents
+    along = tangents(closest.normal)[: own.size if tangential else 0]
+    row, every = np.repeat(np.arange(len(along)), dim - 1), np.arange(own.size)
+    T = rows_along(node[row], weight[row], along.reshape(-1, dim), u.size)
+    areas = (
+        nodal_lengths(x)
+        if dim == 2
+        else current_surface(points, u, slave, "slave").areas
     )
+    one = np.ones(own.size)
+    rows = ContactRows(B, gap + B @ u, T, row, areas, every, one, every)
+    if closest.beyond.any():
+        faces = current_surface(points, u, slave, "slave")
+        radius = np.minimum(faces.radius, side.radius[closest.facet])
+        # the tolerance is for rounding of distances
+        outside = closest.beyond > EXTENSION * radius * (1 + SAME_POINT)
+        if outside.any():
+            sides = partial(mortar if dim == 2 else face_mortar, points, u, slave)
+            integral = partial(sides, master, basis="standard", tangential=tangential)
+            return with_integrals(rows, faces, outside, integral)
+    return rows
 
 
 def geometric_stiffness(
@@ -130,7 +149,7 @@ def geometric_stiffness(
 
     Parameters
     ----------
-    points, u, slave, master, fixed_segments : see `node_to_segment`
+    points, u, slave, master, fixed_segments : see `node_to_facet`
     multipliers : (s,) λ, N/m
 
     Returns
@@ -141,8 +160,9 @@ def geometric_stiffness(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    closest = _projections(x, line, fixed_segments)
-    x_1, x_2 = line.x[closest.segment], line.x[closest.segment + 1]
+    closest = _projections(x, divided(line), fixed_segments)
+    ends = line.facets[closest.facet]
+    x_1, x_2 = line.x[ends[:, 0]], line.x[ends[:, 1]]
     d, e = x - x_1, x_2 - x_1
     L = np.linalg.norm(e, axis=1)
     t, area = e / L[:, None], cross(d, e)
@@ -161,40 +181,35 @@ def geometric_stiffness(
     mixed, (L, area) = outer(area_1, length_1), (v[:, None, None] for v in (L, area))
     gap_2 = (area_2 + area_2.T) / L - (mixed + mixed.transpose(0, 2, 1)) / L**2
     gap_2 += area * (2 * outer(length_1, length_1) / L**3 - length_2 / L**2)
-    inside = (closest.xi > 0) & (closest.xi < 1)
+    inside = ((closest.N > 0) & (closest.N < 1)).all(axis=1)
     if fixed_segments is not None:
         inside |= fixed_segments >= 0
     blocks = -np.where(inside, multipliers, 0.0)[:, None, None] * gap_2
-    nodes = np.column_stack(
-        [slave, master[closest.segment], master[closest.segment + 1]]
-    )
+    nodes = np.column_stack([slave, master[ends]])
     return blocks, dofs_of(nodes, 2).reshape(-1, 6)
 
 
 def _projections(
-    x: Points, line: Surface, fixed_segments: Nodes | None
+    x: Points, side: Simplices, fixed_segments: Nodes | None
 ) -> ClosestPoints:
-    """Return closest points of slave nodes x (s, 2) on the master, possibly extended.
+    """Return closest points of slave nodes x (s, dim) on the master, possibly extended.
 
-    A node with a fixed segment, or beyond an end of the master, is projected onto the
-    line through its segment, where ξ may be outside [0, 1].
+    A node with a fixed segment, or beyond the border of the master, is projected onto
+    the line through its segment (the plane through its triangle), where shape functions
+    may be negative.
     """
-    closest = closest_points(x, line)
-    segment, beyond = closest.segment, closest.beyond
+    closest = closest_points(x, side)
+    facet, simplex, N, normal, beyond = closest
     extended = beyond > 0
     if fixed_segments is not None:
         is_fixed = fixed_segments >= 0
-        segment = np.where(is_fixed, fixed_segments, segment)
+        facet = np.where(is_fixed, fixed_segments, facet)
+        simplex = np.where(is_fixed, fixed_segments, simplex)
         beyond = np.where(is_fixed, 0.0, beyond)
         extended |= is_fixed
-    if not extended.any():
-        return closest
-    xi, length = along_lines(x, line, segment)
-    edge = line.x[segment + 1] - line.x[segment]
-    across = -tangents(edge)[:, 0] / length[:, None]
-    return ClosestPoints(
-        segment,
-        np.where(extended, xi, closest.xi),
-        np.where(extended[:, None], across, closest.normal),
-        beyond,
-    )
+    outside = np.flatnonzero(extended)
+    t = simplex[outside]
+    coordinates = projected(x[outside], side.vertices[t])
+    N[outside] = np.einsum("sv,svc->sc", coordinates, side.shape[t])
+    normal[outside] = side.normals[t]
+    return ClosestPoints(facet, simplex, N, normal, beyond)

@@ -1,1 +1,0 @@
-"""Three-dimensional contact: node to face, and mortar contact between faces."""
