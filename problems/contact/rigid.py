@@ -17,17 +17,16 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.contact.rows import ContactRows, rows_along
 from mortarbench.problems.contact.surface import (
     Points,
     current_positions,
     current_surface,
     tangents,
 )
-from mortarbench.problems.fem.mesh import Nodes, dofs_of
+from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodes_of_side
 
 
 class RigidBody(Protocol):
@@ -110,30 +109,19 @@ def rigid_rows(
         cylinder.
 
     """
-    dim, nodes = points.shape[1], side if side.ndim == 1 else np.unique(side)
+    dim, nodes = points.shape[1], nodes_of_side(side)
     gap, normal = rigid.gap(current_positions(points, u, nodes, "slave"))
-    components, every = dofs_of(nodes, dim).reshape(-1, dim), np.arange(nodes.size)
-    along = -tangents(normal)[: nodes.size if tangential else 0]
+    node, every, one = nodes[:, None], np.arange(nodes.size), np.ones((nodes.size, 1))
+    along = tangents(normal)[: nodes.size if tangential else 0]
     row = np.repeat(np.arange(len(along)), dim - 1)
     reference = current_surface(points, np.zeros_like(u), side, "slave")
     return ContactRows(
-        B=_rows(-normal, components, points.size),
-        c=gap - np.einsum("sx,sx->s", normal, u[components]),
-        T=_rows(along.reshape(-1, dim), components[row], points.size),
+        B=rows_along(node, -one, normal, points.size),
+        c=gap - np.einsum("sx,sx->s", normal, as_vectors(u, dim)[nodes]),
+        T=rows_along(node[row], -one[row], along.reshape(-1, dim), points.size),
         row=row,
         share=reference.areas,
         place=every,
         covered=np.ones(nodes.size),
         at=every,
     )
-
-
-def _rows(values: Points, components: Nodes, n: int) -> csr_array:
-    """Return rows (k, n) with values (k, dim) at components, dropping zeros."""
-    k, dim = values.shape
-    start = dim * np.arange(k + 1)
-    parts = values.ravel(), components.ravel(), start
-    # copy, because the next line works in place
-    rows = csr_array(parts, shape=(k, n), copy=True)
-    rows.eliminate_zeros()
-    return rows

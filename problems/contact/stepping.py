@@ -37,6 +37,12 @@ class Forces(NamedTuple):
     component: Nodes  #: (k,) distinct components
     value: Vector  #: (k,) force at each component
 
+    def on(self, n: int) -> Vector:
+        """Return the forces at all components, (n,)."""
+        f = np.zeros(n)
+        f[self.component] = self.value
+        return f
+
 
 class State(NamedTuple):
     """Initial state of a stage, with w displacement components."""

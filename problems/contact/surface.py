@@ -12,12 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.fem.mesh import (
-    Nodes,
-    as_vectors,
-    nodal_areas,
-    nodal_lengths,
-)
+from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_areas
 
 Points = NDArray[np.float64]  #: (…, dim) positions in m, or dimensionless vectors
 
@@ -63,9 +58,7 @@ class Surface:
     @property
     def areas(self) -> Vector:
         """Nodal ∫N_j (v,): lengths in m (2D), or areas in m² (3D)."""
-        if self.x.shape[1] == 2:
-            return nodal_lengths(self.x)
-        return nodal_areas(self.x, self.facets)[1]
+        return self.areas_in(np.ones(len(self.facets), dtype=bool))
 
     @property
     def radius(self) -> Vector:
@@ -82,12 +75,8 @@ class Surface:
     def areas_in(self, part: NDArray[np.bool_]) -> Vector:
         """Return ∫N_j (v,) over the facets in a mask (f,); see `areas`."""
         areas = np.zeros(len(self.x))
-        if self.x.shape[1] == 2:
-            half = np.linalg.norm(self.end - self.start, axis=1)[part] / 2
-            np.add.at(areas, self.facets[part], half[:, None])
-        else:
-            nodes, values = nodal_areas(self.x, self.facets[part])
-            areas[nodes] = values
+        nodes, values = nodal_areas(self.x, self.facets[part])
+        areas[nodes] = values
         return areas
 
     def part(self, facets: NDArray[np.bool_]) -> Surface:

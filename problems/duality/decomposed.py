@@ -6,7 +6,7 @@ on the contact sides; no undivided stiffness matrix is assembled.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any
@@ -38,13 +38,7 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.friction import friction_of
 from mortarbench.problems.contact.results import BulkResults, results_of
 from mortarbench.problems.contact.rows import MIN_FREE, ContactRows, without_fixed
-from mortarbench.problems.contact.stepping import (
-    Forces,
-    LoadPath,
-    Stage,
-    State,
-    forces_of,
-)
+from mortarbench.problems.contact.stepping import LoadPath, Stage, State
 from mortarbench.problems.duality.feti_dual import (
     TornDual,
     decomposition_quantities,
@@ -236,11 +230,8 @@ def decompose(
     D = elasticity_matrices(bodies.materials, bodies.plane) * unit
     E = np.array([m.E for m in bodies.materials]) * unit
     share = longitudinal_share(D)
-    load = stage.forces._replace(value=stage.forces.value * stage.part)
-    lift, moved = None, np.zeros(contact.rows.shape[1])
-    if bodies.lift is not None:
-        moved = bodies.lift * stage.part
-        lift = force_lookup(forces_of(moved))
+    n = contact.rows.shape[1]
+    lift = None if bodies.lift is None else bodies.lift * stage.part
     return DecomposedProblem(
         layout=layout,
         components=bodies.shape.dim,
@@ -251,10 +242,12 @@ def decompose(
         piece=pieces,
         shaping=None if layout.shaping is None else layout.shaping(share),
         fixed=stage.fixed,
-        load=force_lookup(load),
+        load=stage.forces.on(n) * stage.part,
         lift=lift,
         glue=glue,
-        contact=_without_supports(contact, stage.fixed, moved),
+        contact=_without_supports(
+            contact, stage.fixed, np.zeros(n) if lift is None else lift
+        ),
     )
 
 
@@ -277,25 +270,6 @@ def _without_supports(contact: Contact, fixed: Nodes, u: Vector) -> Contact:
     rows = csr_array(contact.rows - off)
     rows.eliminate_zeros()
     return contact._replace(rows=rows, c=contact.c - off @ u)
-
-
-def force_lookup(forces: Forces) -> Callable[[Nodes], Vector]:
-    """Return a function that maps displacement components (k,) to forces (k,).
-
-    Components that are not listed in `forces` are unloaded.
-    """
-    order = np.argsort(forces.component)
-    components = forces.component[order]
-
-    def of(component: Nodes) -> Vector:
-        values = np.zeros(component.size)
-        loaded = np.isin(component, components)
-        values[loaded] = forces.value[
-            order[np.searchsorted(components, component[loaded])]
-        ]
-        return values
-
-    return of
 
 
 def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:

@@ -159,8 +159,7 @@ def load_path(
     def bodies_of(stage: Stage) -> Bodies:
         names = id(stage.forces), id(stage.fixed)
         if names not in bodies_by_stage:
-            f = np.zeros(bodies.mesh.dofs)
-            f[stage.forces.component] = stage.forces.value
+            f = stage.forces.on(bodies.mesh.dofs)
             supports = support_rows(bodies.mesh, stage.fixed)
             bodies_by_stage[names] = replace(bodies, f=f, B_D=supports)
         return bodies_by_stage[names]

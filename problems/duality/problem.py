@@ -179,6 +179,13 @@ class Meshed(Shape):
         return self._labelled([graph_partition(mesh.points, mesh.cells, body, size)])
 
 
+#: fields that `ElasticBodies` and `UnassembledBodies` have in common
+COMMON = (
+    "names", "materials", "plane", "length", "force", "pairs", "piece", "lift",
+    "springs",
+)  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ElasticBodies:
     """Elastic bodies with materials, supports, full load and contact sides."""
@@ -204,23 +211,14 @@ class ElasticBodies:
     @cached_property
     def whole(self) -> UnassembledBodies:
         """The undivided bodies without stiffness matrix."""
-        mesh = self.shape.mesh
-        f = np.zeros(mesh.dofs)
-        f[self.forces.component] = self.forces.value
+        mesh, body = self.shape.joined
+        common: dict[str, Any] = {name: getattr(self, name) for name in COMMON}
         return UnassembledBodies(
             mesh=mesh,
-            body=self.shape.body,
-            names=self.names,
-            materials=self.materials,
-            plane=self.plane,
-            length=self.length,
-            force=self.force,
-            f=f,
+            body=body,
+            f=self.forces.on(mesh.dofs),
             B_D=support_rows(mesh, self.fixed),
-            pairs=self.pairs,
-            piece=self.piece,
-            lift=self.lift,
-            springs=self.springs,
+            **common,
         )
 
     @cached_property
@@ -253,19 +251,12 @@ class ElasticBodies:
 
 def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
     """Return meshed bodies as `ElasticBodies`; an assembled stiffness is kept."""
+    common: dict[str, Any] = {name: getattr(bodies, name) for name in COMMON}
     result = ElasticBodies(
         shape=Meshed((bodies.mesh, bodies.body)),
-        names=bodies.names,
-        materials=bodies.materials,
-        plane=bodies.plane,
-        length=bodies.length,
-        force=bodies.force,
         fixed=bodies.B_D.indices,
         forces=forces_of(bodies.f),
-        pairs=bodies.pairs,
-        piece=bodies.piece,
-        lift=bodies.lift,
-        springs=bodies.springs,
+        **common,
     )
     vars(result)["whole"] = bodies
     if isinstance(bodies, Bodies):
@@ -300,11 +291,6 @@ class ContactSolution(Protocol):
         """Return the nondimensional displacement at global components (k,)."""
 
 
-def no_further_results(solution: ContactSolution) -> dict[str, Any]:
-    """Return an empty dictionary: a problem without further quantities."""
-    return {}
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactProblem:
     """Elastic bodies with their contact law and load stages."""
@@ -319,7 +305,7 @@ class ContactProblem:
     #: normal force per slave node for the first friction bound of Coulomb's law
     initial_force: float = 0.0
     #: function that evaluates quantities beyond those common to all elastic bodies
-    results: Callable[[ContactSolution], Mapping[str, Any]] = no_further_results
+    results: Callable[[ContactSolution], Mapping[str, Any]] = lambda _: {}
     #: (k, 3) with the columns x in m, exact pressure and exact shear in Pa on the slave
     #: side; None if unknown
     exact: NDArray[np.float64] | None = None

@@ -7,7 +7,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.sparse import csc_array, csr_array, hstack
 
@@ -17,10 +16,9 @@ from mortarbench.harness.mechanics import (
     contact_data,
     friction_discs,
 )
-from mortarbench.problems.fem.elasticity import rigid_modes, rigid_motions
+from mortarbench.problems.fem.elasticity import rigid_modes
 from mortarbench.problems.fem.mesh import dofs_of
 from mortarbench.problems.feti.served import Served, parts_of
-from mortarbench.problems.feti.subdivision import Points
 from mortarbench.problems.feti.subdomains import DecomposedProblem
 
 
@@ -44,7 +42,7 @@ def torn_mechanics(
         return DecomposedMechanics(
             parts=parts,
             exact=contact_data(
-                problem.load(np.arange(n)).astype(Real),
+                problem.load.astype(Real),
                 (rows, contact.c[acts]),
                 friction_discs(bound[bound > 0], contact.tangents, m - bound.size),
                 np.unique(problem.fixed),
@@ -66,8 +64,6 @@ def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
     kernel, rigid = [none], [none]
     for b, name in enumerate(problem.names):
         fixed, axes = node[body == b], axis[body == b]
-        if _prevents_motion(layout.mesh.points[fixed], axes, d):
-            continue
         of_body = np.unique(
             layout.torn.number[problem.piece_of[layout.torn.subdomain] == b]
         )
@@ -79,6 +75,8 @@ def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
         )
         at = d * np.searchsorted(of_body, fixed) + axes
         allowed = R @ null_space(R[at]) if at.size else R.copy()
+        if not allowed.shape[1]:  # the supports prevent all motions
+            continue
         allowed[at] = 0
         embedding = csr_array(
             (np.ones(dofs.size), (dofs, np.arange(dofs.size))),
@@ -92,12 +90,3 @@ def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
         "rigid": csr_array(hstack(rigid)),
         "names": tuple(names),
     }
-
-
-def _prevents_motion(points: Points, axes: NDArray[np.int64], d: int) -> bool:
-    """Return True if no rigid motion is zero along `axes[i]` at all points i."""
-    if d == 1 or not len(points):
-        return len(points) > 0
-    size = np.ptp(points, axis=0).max() or 1.0
-    R = rigid_motions(points / size)[d * np.arange(axes.size) + axes]
-    return bool(np.linalg.matrix_rank(R) == R.shape[1])

@@ -93,11 +93,10 @@ class DecomposedProblem:
     #: body is a piece
     piece: Integers | None = None
     shaping: Shaping | None = None  #: factors of E; None if all are 1
-    load: Callable[[Nodes], Vector]  #: map from global components (k,) to forces (k,)
+    load: Vector  #: (n,) forces at global components
     fixed: Nodes  #: prescribed global components, in the order of their rows
-    #: map from global components (k,) to prescribed displacements, or zero elsewhere;
-    #: None: all are zero
-    lift: Callable[[Nodes], Vector] | None = None
+    #: (n,) prescribed displacements, and zeros; None: all are zero
+    lift: Vector | None = None
     #: True to eliminate fixed components, as in FETI-1 (Farhat and Roux 1991), instead
     #: of adding rows to B. Subdomains with supports then do not float and keep the
     #: global axes
@@ -248,7 +247,7 @@ class TornBodies:
         """Torn load (N,) in subdomain axes; copies of a node have equal shares."""
         d = self.problem.components
         multiplicity = np.repeat(self.nodes.multiplicity, d)
-        load = self.problem.load(self.component) / multiplicity
+        load = self.problem.load[self.component] / multiplicity
         if d > 1:
             shared = load.reshape(-1, d)
             loaded = np.flatnonzero(shared.any(axis=1))
@@ -352,8 +351,7 @@ def _rows(torn: TornBodies) -> Rows:
     c = np.append(np.zeros(E), scale * contact.c)
     if problem.lift is not None:
         supports = slice(0, int(problem.layout.multiplicity(problem.fixed // d).sum()))
-        every = np.arange(d * problem.layout.nodes)
-        c[supports] = (B @ (torn.spread @ problem.lift(every)))[supports]
+        c[supports] = (B @ (torn.spread @ problem.lift))[supports]
     return Rows(B=B, c=c, equalities=E)
 
 

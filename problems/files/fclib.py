@@ -36,11 +36,11 @@ from scipy.sparse.linalg import splu
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.harness.checked import located
-from mortarbench.harness.files.datafile import check_size, opened, parsing
+from mortarbench.harness.files.datafile import check_size
+from mortarbench.problems.fem.mesh_files.hdf5 import opened_hdf5
 from mortarbench.problems.files.friction_cones import FrictionalContact
 
 SUFFIX = ".hdf5"
-_EXPECTED = "an FCLIB file (HDF5)"
 _KINDS = ("fclib_local", "fclib_global")
 _COLUMNS, _ROWS = -1, -2  #: values of nz for compressed matrices
 
@@ -69,30 +69,9 @@ def read_datasets(path: Path) -> Datasets:
         other files.
 
     """
-    import h5py  # imported here, because workers of solvers do not need HDF5
-
-    datasets: dict[str, h5py.Dataset] = {}
-
-    def find(name: Any, node: Any) -> None:
-        if not isinstance(name, str):
-            raise ValueError("a name is not UTF-8")
-        if isinstance(node, h5py.Dataset):
-            datasets[name] = node
-
-    wrong = f"damaged, or not HDF5; expected {_EXPECTED}"
-    with opened(path, _EXPECTED) as stream:
-        with parsing(path, wrong, 0):
-            file = h5py.File(stream, "r")
-            file.visititems(find)
-            size = sum(node.size * node.dtype.itemsize for node in datasets.values())
-            if any(node.external or node.is_virtual for node in datasets.values()):
-                raise InputError(
-                    f"{path}: arrays in other files, which are not opened; expected "
-                    "all data in this file"
-                )
-        check_size(f"{path}: its content", size)
-        with parsing(path, wrong, 2 * size), file:
-            return {name: np.asarray(node[()]) for name, node in datasets.items()}
+    with opened_hdf5(path, "an FCLIB file", 2) as nodes:
+        arrays = {k: node for k, node in nodes.items() if hasattr(node, "dtype")}
+        return {name: np.asarray(node[()]) for name, node in arrays.items()}
 
 
 def read_fclib(path: Path) -> FclibFile:

@@ -200,7 +200,7 @@ class Membranes:
             assemble_class=membrane_class,
             E=np.ones(2),
             names=NAMES,
-            load=self.load,
+            load=self.load(np.arange(layout.nodes)),
             glue=rows,
             fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),

@@ -44,7 +44,7 @@ from mortarbench.harness import (
 )
 from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.stepping import Forces
-from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
+from mortarbench.problems.duality.decomposed import elastic_class
 from mortarbench.problems.duality.dualisation import Transformed, primal_form
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
@@ -205,7 +205,7 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     clamped = _clamped(mesh.boundaries, mesh.dim)
     primal = QP(
         P=stiffness(mesh, D, material),
-        q=-parts.load(np.arange(n)),
+        q=-parts.load,
         A=one[clamped],
         b=np.zeros(clamped.size),
         G=no_rows(n),
@@ -240,7 +240,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
         glue=p["glue"],
         material=_material(p),
         assemble_class=partial(elastic_class, D=D, E=moduli),
-        load=force_lookup(_pull(layout, shape.sides["right"], p["load"])),
+        load=_pull(layout, shape.sides["right"], p["load"]).on(shape.mesh.dofs),
         fixed=_clamped(shape.sides, shape.dim),
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(shape.dim * layout.nodes), none, none),

@@ -24,11 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError
-from mortarbench.harness.files.datafile import check_size, opened, parsing
 from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.fem.mesh_files.hdf5 import opened_hdf5
 from mortarbench.problems.fem.mesh_files.named import DIMENSION, FileMesh, Words
 
-_EXPECTED = "a .med file"
 _KINDS = {
     "PO1": "vertex",
     "SE2": "line",
@@ -79,26 +78,8 @@ def read_med(path: Path) -> FileMesh:
         refers to other files.
 
     """
-    import h5py  # imported here, because workers of solvers do not need HDF5
-
-    nodes: dict[str, Any] = {}
-    with opened(path, _EXPECTED) as stream:
-        with parsing(path, "not a .med file (HDF5), or damaged", 0):
-            file = h5py.File(stream, "r")
-            # visititems follows neither soft nor external links, which may lead to
-            # other files
-            file.visititems(nodes.__setitem__)
-            arrays = {k: v for k, v in nodes.items() if isinstance(v, h5py.Dataset)}
-            sizes = [v.size * v.dtype.itemsize for v in arrays.values()]
-            if any(v.external or v.is_virtual for v in arrays.values()):
-                raise InputError(
-                    f"{path}: arrays in other files, which are not opened; expected "
-                    "all data in this file"
-                )
-        check_size(f"{path}: its arrays", _PARSER_FACTOR * sum(sizes))
-        room = _PARSER_FACTOR * sum(sizes)
-        with parsing(path, "not a mesh in MED format, or damaged", room), file:
-            return _mesh(path, nodes)
+    with opened_hdf5(path, "a .med file", _PARSER_FACTOR) as nodes:
+        return _mesh(path, nodes)
 
 
 def _mesh(path: Path, nodes: Mapping[str, Any]) -> FileMesh:

@@ -302,7 +302,7 @@ def outside(file, step):
         (huge, "its arrays would take 183105468 MiB of memory; expected at most"),
         (outside, "cells refer to nodes that are not in the file; define these"),
         (lambda file, step: step["MAI/HE8/NOD"].attrs.modify("NBR", 7),
-         "not a mesh in MED format, or damaged"),
+         "damaged, or not a .med file in HDF5"),
     ],
 )  # fmt: skip
 def test_a_med_file_that_cannot_be_read_is_refused_in_one_line(
@@ -318,7 +318,7 @@ def test_a_med_file_that_cannot_be_read_is_refused_in_one_line(
 def test_other_content_is_not_a_med_file(tmp_path):
     for content in (b"", b"hello", b"\x89HDF\r\n\x1a\n" + bytes(200)):
         (tmp_path / "a.med").write_bytes(content)
-        with pytest.raises(InputError, match=r"a\.med: not a \.med file \(HDF5\)"):
+        with pytest.raises(InputError, match=r"a\.med: damaged, or not a \.med file"):
             read_msh(tmp_path / "a.med")
 
 

@@ -8,8 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import block_diag, csr_array, eye_array
 
-from mortarbench.problems.contact.stepping import Forces
-from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
+from mortarbench.problems.duality.decomposed import elastic_class
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.mesh import box_grid, rectangle
 from mortarbench.problems.feti.subdivision import Subdivision
@@ -298,7 +297,7 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     problem = DecomposedProblem(
         layout=layout, components=2, material=np.zeros(2, dtype=np.int64),
         assemble_class=partial(elastic_class, D=D, E=E), E=E, names=("plate",),
-        load=force_lookup(Forces(np.arange(n), load)), fixed=held, glue="orthonormal",
+        load=load, fixed=held, glue="orthonormal",
         contact=Contact(
             csr_array(eye_array(n, format="csr")[held[:1]]), np.ones(1), np.zeros(0)
         ),

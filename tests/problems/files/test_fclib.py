@@ -233,13 +233,13 @@ def test_invalid_and_nonconvex_problems_are_refused(tmp_path, arrays, message):
 
 def test_a_file_that_is_not_hdf5_is_refused(tmp_path, monkeypatch):
     (tmp_path / "text.hdf5").write_text("text")
-    with pytest.raises(InputError, match="damaged, or not HDF5"):
+    with pytest.raises(InputError, match="damaged, or not an FCLIB file"):
         case_of(tmp_path / "text.hdf5")
     whole = tmp_path / "whole.hdf5"
     write_boxes(whole)
     data = whole.read_bytes()
     (tmp_path / "half.hdf5").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match="damaged, or not HDF5"):
+    with pytest.raises(InputError, match="damaged, or not an FCLIB file"):
         case_of(tmp_path / "half.hdf5")
     large = one_contact() | {"fclib_local/vectors/q": np.zeros(2**18)}
     write_datasets(tmp_path / "large.hdf5", large)
@@ -414,7 +414,7 @@ def test_a_name_that_is_not_text_is_refused_in_one_line(tmp_path):
     assert data.count(b"fclib_local") == 1
     path.write_bytes(data.replace(b"fclib_local", b"fclib_l\xffcal"))
 
-    with pytest.raises(InputError, match=r"one\.hdf5: damaged, or not HDF5; expected"):
+    with pytest.raises(InputError, match=r"one\.hdf5: damaged, or not an FCLIB file"):
         read_fclib(path)
 
 
