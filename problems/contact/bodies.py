@@ -55,14 +55,6 @@ class ContactPair(NamedTuple):
     #: extent of the two sides, or no limit for a rigid master
     reach: float | None = None
 
-    def renumbered(self, nodes: Nodes) -> ContactPair:
-        """Return the pair in the numbering of a mesh that contains only `nodes`.
-
-        nodes : (k,) ascending global numbers
-        """
-        slave, master = (np.searchsorted(nodes, part) for part in self.sides)
-        return self._replace(slave=slave, master=master)
-
     @property
     def sides(self) -> tuple[Nodes, Nodes]:
         """Slave side and master side."""

@@ -27,7 +27,7 @@ import numpy as np
 from mortarbench.harness import Friction, InputError, Vector
 from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.mechanics import NO_FRICTION
-from mortarbench.problems.contact.bodies import ContactSides, UnassembledBodies
+from mortarbench.problems.contact.bodies import UnassembledBodies
 from mortarbench.problems.contact.rows import ContactRows
 
 T = TypeVar("T")
@@ -73,7 +73,7 @@ def law_of(params: Mapping[str, Any]) -> FrictionLaw:
 
 
 def friction_of(
-    bodies: UnassembledBodies | ContactSides,
+    bodies: UnassembledBodies,
     rows: ContactRows,
     laws: Sequence[FrictionLaw],
     slip_origin: Vector,

@@ -12,7 +12,7 @@ from mortarbench.harness import QP, Fields, Friction, Solution, Vector
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.harness.sets.blocks import norms
-from mortarbench.problems.contact.bodies import Bodies, ContactSides
+from mortarbench.problems.contact.bodies import Bodies, UnassembledBodies
 from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.contact.sides import (
     ACTIVE_THRESHOLD,
@@ -69,7 +69,7 @@ def quantities(
 
 def results_of(
     bulk: BulkResults,
-    bodies: Bodies | ContactSides,
+    bodies: UnassembledBodies,
     primal: QP,
     s: Solution,
     rows: ContactRows,
@@ -114,7 +114,7 @@ def results_of(
 
 
 def _contact_force(
-    bodies: Bodies | ContactSides, forces: NDArray[np.float64]
+    bodies: UnassembledBodies, forces: NDArray[np.float64]
 ) -> dict[str, list[float]]:
     """Return the total force on one body of a single pair; {} for several pairs."""
     if len(bodies.pairs) > 1:
@@ -128,7 +128,10 @@ def _contact_force(
 
 
 def friction_quantities(
-    bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
+    bodies: UnassembledBodies,
+    primal: QP,
+    s: Solution,
+    friction: Friction,
 ) -> dict[str, Any]:
     """Return counts of friction states, the residual of Coulomb's law and dissipation.
 
@@ -158,7 +161,7 @@ def friction_quantities(
 
 
 def pair_results(
-    bodies: Bodies | ContactSides,
+    bodies: UnassembledBodies,
     primal: QP,
     s: Solution,
     rows: ContactRows,
@@ -242,7 +245,7 @@ def fields(
 
 
 def contact_forces(
-    bodies: Bodies | ContactSides,
+    bodies: UnassembledBodies,
     primal: QP,
     s: Solution,
     friction: Friction = NO_FRICTION,

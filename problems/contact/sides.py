@@ -11,7 +11,6 @@ from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.harness.sets.blocks import norms
 from mortarbench.problems.contact.bodies import (
-    Bodies,
     ContactPair,
     ContactSides,
     UnassembledBodies,
@@ -40,7 +39,7 @@ _STATE = f"U{len(SLIDING)}"  #: dtype of arrays of states; SLIDING is the longes
 
 
 def contact_sides(
-    bodies: Bodies | ContactSides,
+    bodies: UnassembledBodies,
     primal: QP,
     s: Solution,
     rows: ContactRows,

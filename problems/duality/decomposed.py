@@ -6,14 +6,14 @@ on the contact sides; no undivided stiffness matrix is assembled.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array, vstack
+from scipy.sparse import csc_array, csr_array, diags_array
 
 from mortarbench.harness import (
     QP,
@@ -27,13 +27,13 @@ from mortarbench.harness import (
     Vector,
 )
 from mortarbench.harness.distributed.comm import Comm, led
-from mortarbench.harness.mechanics import boundary_facets
+from mortarbench.harness.mechanics import boundary_facets, contact_rows
 from mortarbench.problems.contact.bodies import (
-    ContactPair,
-    ContactSides,
+    UnassembledBodies,
     elasticity_matrices,
     joined_names,
     slave_places,
+    support_rows,
 )
 from mortarbench.problems.contact.friction import friction_of
 from mortarbench.problems.contact.results import BulkResults, results_of
@@ -78,15 +78,12 @@ class DecomposedLinearisation:
     All ranks must call its methods together; the results are equal on all ranks.
     """
 
-    stage: Stage
+    bodies: UnassembledBodies
     served: Served
-    sides: LinearisedSides
+    primal: QP  #: supports and contact rows, with P = 0
+    rows: ContactRows  #: contact rows of `primal`, m
+    friction: Friction
     reference: ReferenceOfOperator
-
-    @property
-    def friction(self) -> Friction:
-        """Friction at the nodes of the contact sides."""
-        return self.sides.friction
 
     @cached_property
     def dual(self) -> TornDual:
@@ -105,20 +102,15 @@ class DecomposedLinearisation:
 
     def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
-        return self.dual.multipliers(s)[: self.sides.c.size]
+        return self.dual.multipliers(s)[: self.rows.c.size]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (w,) on the contact sides and the normal forces (places,).
-
-        `places` is the number of slave nodes. Displacements and forces are
-        nondimensional.
-        """
-        sides, comm = self.sides, self.served.torn.comm
-        u = led(comm, self.served, lambda: self.dual.displacement(s)[sides.component])
+        """Return u (n,) and the normal forces (places,) of all slave nodes."""
+        u = led(self.served.torn.comm, self.served, lambda: self.dual.displacement(s))
         self.served.forget()  # release the large explicit blocks
         # negative multipliers of inexact solutions would be negative friction bounds
         normal = np.maximum(self.normal_multipliers(s), 0.0)
-        return u, sides.rows.at_places(normal, slave_places(sides.bodies.pairs))
+        return u, self.rows.at_places(normal, slave_places(self.bodies.pairs))
 
 
 def decomposed_path(
@@ -129,21 +121,43 @@ def decomposed_path(
     All ranks must call this function, and the methods of the path, together.
     """
     layout, elastic = cached_layout(problem.bodies, choice.size), problem.bodies
-    first = list[TornBodies]()
+    bodies, first = elastic.whole, list[TornBodies]()
+    zero, places = np.zeros(bodies.mesh.dofs), slave_places(elastic.pairs)
 
     def pose(stage: Stage, at: State) -> DecomposedLinearisation:
-        sides = linearise_sides(problem, layout, stage, at)
-        parts = decompose(elastic, layout, choice.glue, stage, sides.contact)
+        rows = problem.linearise(bodies, stage.laws)(at.u * bodies.length)
+        rows = without_fixed(rows, stage.fixed)
+        friction = friction_of(
+            bodies, rows, stage.laws, at.slip_origin, at.normal_forces
+        )
+        primal = QP(
+            P=csc_array((zero.size, zero.size)),
+            q=zero,
+            A=support_rows(bodies.mesh, stage.fixed),
+            b=np.zeros(stage.fixed.size),
+            G=rows.B,
+            h=rows.c / bodies.length,
+            lb=np.full(zero.size, -np.inf),
+            ub=np.full(zero.size, np.inf),
+        )
+        contact = contact_of(primal, friction)
+        parts = decompose(elastic, layout, choice.glue, stage, contact)
         if not first:
             first.append(TornBodies(parts, comm))
         # the bodies are unchanged, so reuse their classes of subdomains
-        torn = first[0].with_problem(parts)
-        return DecomposedLinearisation(stage, Served(torn), sides, reference)
+        served = Served(first[0].with_problem(parts))
+        return DecomposedLinearisation(
+            bodies, served, primal, rows, friction, reference
+        )
 
-    zero = np.zeros(elastic.shape.dim * side_nodes(elastic.pairs).size)
-    forces = np.full(slave_places(elastic.pairs), problem.initial_force)
-    rest = State(zero, zero, forces)
+    rest = State(zero, zero, np.full(places, problem.initial_force))
     return LoadPath(problem.stages, pose, rest)
+
+
+def contact_of(primal: QP, friction: Friction) -> Contact:
+    """Return the contact rows of `primal`, followed by the friction rows."""
+    rows, c = contact_rows(primal, friction)
+    return Contact(csr_array(rows), c, friction.bound, friction.tangents)
 
 
 @lru_cache(maxsize=4)
@@ -177,16 +191,16 @@ def case_on_ranks(
     torn = chosen.problem.served.torn.with_bound(chosen.friction.bound)
     served = Served(torn, partial(largest_stresses, torn, problem.bodies))
     first = path.problems(0)[0].problem.served.torn if others else torn
-    sides = replace(chosen.problem.sides, friction=chosen.friction)
+    linearised = replace(chosen.problem, friction=chosen.friction)
 
     def case() -> Case:
         dual, elastic = TornDual(served), problem.bodies
         displacement = lru_cache(maxsize=1)(dual.displacement)
-        mechanics, bound = torn_mechanics(served), sides.friction.bound
-        acts = np.append(np.ones(sides.c.size), bound) > 0
+        mechanics, bound = torn_mechanics(served), chosen.friction.bound
+        acts = np.append(np.ones(linearised.rows.c.size), bound) > 0
 
         def quantities(s: Solution) -> Mapping[str, Any]:
-            state = TornSolution(dual, displacement(s), s, sides, elastic, count)
+            state = TornSolution(dual, displacement(s), s, linearised, count)
             return {
                 **_quantities(problem, state),
                 **decomposition_quantities(served, dual.qp),
@@ -272,75 +286,6 @@ def _without_supports(contact: Contact, fixed: Nodes, u: Vector) -> Contact:
     return contact._replace(rows=rows, c=contact.c - off @ u)
 
 
-def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
-    """Return the nodes of all contact sides, ascending."""
-    return np.unique(np.concatenate([pair.nodes for pair in pairs]))
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LinearisedSides:
-    """Nondimensional linearised contact, restricted to nodes of the contact sides."""
-
-    bodies: ContactSides  #: contact sides with a total of N nodes
-    node: Nodes  #: (N,) global numbers of these nodes
-    nodes: int  #: number of nodes of the bodies
-    rows: ContactRows  #: contact rows B u ≤ c in local components, m
-    fixed: Nodes  #: local components that supports prescribe
-    friction: Friction  #: friction rows; empty without friction
-
-    @property
-    def c(self) -> Vector:
-        """Right-hand sides (m,), nondimensional."""
-        return self.rows.c / self.bodies.length
-
-    @property
-    def component(self) -> Nodes:
-        """Global components of the columns of `B`, (dim·N,)."""
-        return dofs_of(self.node, self.bodies.mesh.dim)
-
-    @property
-    def contact(self) -> Contact:
-        """Contact rows followed by friction rows, in global components."""
-        friction, B, c = self.friction, self.rows.B, self.c
-        if friction.bound.size:
-            B = csr_array(vstack([B, friction.T]))
-            c = np.append(c, friction.start)
-        rows = csr_array(
-            (B.data, self.component[B.indices], B.indptr),
-            shape=(B.shape[0], self.bodies.mesh.dim * self.nodes),
-        )
-        return Contact(rows, c, friction.bound, friction.tangents)
-
-
-def linearise_sides(
-    problem: ContactProblem, layout: Subdivision, stage: Stage, at: State
-) -> LinearisedSides:
-    """Linearise contact at the start of a stage."""
-    elastic = problem.bodies
-    node = side_nodes(elastic.pairs)
-    bodies = ContactSides(
-        mesh=Mesh(layout.mesh.points[node], np.zeros((0, 4), dtype=np.int64), {}),
-        body_of_node=np.asarray(layout.body[layout.holder(node)]),
-        names=elastic.names,
-        pairs=tuple(pair.renumbered(node) for pair in elastic.pairs),
-        length=elastic.length,
-        force=elastic.force,
-    )
-    fixed = np.flatnonzero(np.isin(dofs_of(node, elastic.shape.dim), stage.fixed))
-    rows = problem.linearise(bodies, stage.laws)(at.u * elastic.length)
-    rows = without_fixed(rows, fixed)
-    return LinearisedSides(
-        bodies=bodies,
-        node=node,
-        nodes=layout.nodes,
-        rows=rows,
-        fixed=fixed,
-        friction=friction_of(
-            bodies, rows, stage.laws, at.slip_origin, at.normal_forces
-        ),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class TornSolution:
     """Solution of torn bodies on rank 0; see `ContactSolution`."""
@@ -348,8 +293,7 @@ class TornSolution:
     dual: TornDual
     u: Vector  #: nondimensional displacement (n,)
     solution: Solution
-    linearised: LinearisedSides
-    elastic: ElasticBodies
+    linearised: DecomposedLinearisation
     problems: int
 
     def at(self, component: Nodes) -> Vector:
@@ -366,29 +310,19 @@ class TornSolution:
     @cached_property
     def sides(self) -> InterfaceState:
         """State of the contact interface."""
-        sides, component = self.linearised, self.linearised.component
-        w = component.size
-        diagonal, free = np.zeros(w), np.full(w, np.inf)
-        if sides.friction.bound.size:
-            diagonal = self.dual.parts.diagonal(component)
-        primal = QP(
-            P=csc_array(diags_array(diagonal)),
-            q=np.zeros(w),
-            A=csr_array(eye_array(w, format="csr")[sides.fixed]),
-            b=np.zeros(sides.fixed.size),
-            G=sides.rows.B,
-            h=sides.c,
-            lb=-free,
-            ub=free,
-        )
+        at, n, diagonal = self.linearised, self.u.size, np.zeros(self.u.size)
+        if at.friction.bound.size:
+            components = np.unique(at.friction.T.indices)
+            diagonal[components] = self.dual.parts.diagonal(components)
         s = Solution(
             status=Status.SOLVED,
-            x=self.at(component),
-            y=np.zeros(sides.fixed.size),
+            x=self.u,
+            y=np.zeros(at.primal.b.size),
             z=self.dual.multipliers(self.solution),
-            z_box=np.zeros(w),
+            z_box=np.zeros(n),
         )
-        return InterfaceState(sides.bodies, primal, s, sides.rows, sides.friction)
+        primal = replace(at.primal, P=csc_array(diags_array(diagonal)))
+        return InterfaceState(at.bodies, primal, s, at.rows, at.friction)
 
 
 def _quantities(problem: ContactProblem, solution: TornSolution) -> dict[str, Any]:

@@ -265,12 +265,10 @@ def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
 
 
 class InterfaceState(NamedTuple):
-    """Data and solution of a contact problem at all nodes, or only at contact sides."""
+    """Data and solution of a contact problem."""
 
-    bodies: Bodies | ContactSides
-    #: QP for the nodes of `bodies`; only the diagonal of P is used, and only with
-    #: friction
-    primal: QP
+    bodies: UnassembledBodies
+    primal: QP  #: only the diagonal of P is used, and only with friction
     solution: Solution
     rows: ContactRows  #: contact rows of `primal`
     friction: Friction

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from time import perf_counter
 
-from mortarbench.harness.mechanics import contact_rows
 from mortarbench.problems.contact.stepping import Iterate
-from mortarbench.problems.duality.decomposed import cached_layout, decompose
+from mortarbench.problems.duality.decomposed import cached_layout, contact_of, decompose
 from mortarbench.problems.duality.dualisation import TornForm
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
@@ -21,7 +20,7 @@ from mortarbench.problems.duality.monolithic import (
 from mortarbench.problems.duality.problem import Choice, ContactProblem
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
-from mortarbench.problems.feti.subdomains import Contact, TornBodies
+from mortarbench.problems.feti.subdomains import TornBodies
 
 
 def torn_form(
@@ -60,9 +59,8 @@ def _torn(
 
     stage : number of the stage of the problem
     """
-    elastic, friction = problem.bodies, linearised.friction
-    rows, c = contact_rows(linearised.problem.primal, friction)
-    contact = Contact(rows, c, friction.bound, friction.tangents)
+    elastic = problem.bodies
+    contact = contact_of(linearised.problem.primal, linearised.friction)
     layout = cached_layout(elastic, choice.size)
     of_stage = problem.stages[stage]
     parts = decompose(elastic, layout, choice.glue, of_stage, contact)

@@ -24,9 +24,8 @@ import numpy as np
 
 from mortarbench.harness import QP, Friction, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import (
-    Bodies,
     ContactPair,
-    ContactSides,
+    UnassembledBodies,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
@@ -157,7 +156,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
 
 
 def published_quantities(
-    bodies: Bodies | ContactSides,
+    bodies: UnassembledBodies,
     primal: QP,
     s: Solution,
     rows: ContactRows,

@@ -51,7 +51,6 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import QP, Case, Friction, Reference, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import (
-    Bodies,
     ContactPair,
     ContactSides,
     UnassembledBodies,
@@ -413,7 +412,7 @@ def _pressing(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
 
 
 def pressure_quantities(
-    bodies: Bodies | ContactSides, primal: QP, exact: LineContact, s: Solution
+    bodies: UnassembledBodies, primal: QP, exact: LineContact, s: Solution
 ) -> dict[str, Any]:
     """Compare the pressure on the slave side with Hertz's pressure.
 
@@ -441,7 +440,7 @@ def pressure_quantities(
 
 
 def shear_quantities(
-    bodies: Bodies | ContactSides,
+    bodies: UnassembledBodies,
     primal: QP,
     exact: LineContact,
     s: Solution,
