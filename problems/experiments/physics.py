@@ -7,25 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from mortarbench.harness import Reference, Value
-from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
-from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.results import quantities
-from mortarbench.problems.contact.stepping import Iterate, forces_of, load_steps
-from mortarbench.problems.duality.monolithic import (
-    MonolithicLinearisation,
-    MonolithicPath,
-    load_path,
-    recovered,
-)
-from mortarbench.problems.duality.problem import Linearise
+from mortarbench.harness import Case, Reference, Value
+from mortarbench.harness.plugin import Family
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
+from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.problems.families.hertz import HertzCylinder
 from mortarbench.problems.families.patch import ContactPatch
-from mortarbench.problems.fem.inverse import GeneralisedInverse
-from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
-from mortarbench.problems.models.beam_ring import LENGTH, model
+from mortarbench.problems.fem.mesh import nodal_lengths
 
 #: numbers of load steps and of linearisations per step for which the result is
 #: converged: larger numbers do not change the result
@@ -48,41 +37,18 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
     linearised at the solution itself; the other rows approach this result as steps or
     relin increase.
     """
-    bodies = model(*plan.stepped, 2 * plan.stepped[1], "strain")
-    inverse, linearise = factorise_clamped(bodies), linearisation(bodies, "nts", "dual")
+    Nr, Nh = plan.stepped
     variants = [(s, r) for r in plan.relin for s in plan.stepping]
     for steps, relin in (*variants, CONVERGED):
-        path = _path(bodies, linearise, inverse, solve, steps, relin)
-        yield {"steps": steps, "relin": relin} | _results(bodies, path.problem(steps))
-
-
-def _path(
-    bodies: Bodies,
-    linearise: Linearise,
-    inverse: GeneralisedInverse,
-    solve: Reference,
-    steps: int,
-    relin: int = 1,
-) -> MonolithicPath:
-    stages = load_steps(steps, relin, forces_of(bodies.f), bodies.B_D.indices)
-    return load_path(bodies, stages, lambda _: linearise, lambda _: inverse, solve)
-
-
-def _results(
-    bodies: Bodies, chosen: Iterate[MonolithicLinearisation]
-) -> dict[str, Value]:
-    s, linearised = recovered(chosen), chosen.problem
-    values = quantities(bodies, linearised.primal, s, linearised.rows)
-    sides = bodies.mesh.boundaries
-    tip = s.x[dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)] * LENGTH
-    force = values["contact_force"]
-    return {
-        "tip_x": float(tip[0]),
-        "tip_y": float(tip[1]),
-        "energy": values["energy"],
-        "force_x": force[0],
-        "force_y": force[1],
-    }
+        keys = {"Nr": Nr, "Nh": Nh, "steps": steps, "step": steps, "relin": relin}
+        values = _quantities(BeamRing(), keys, solve, "dual-bounds")
+        yield {
+            "steps": steps,
+            "relin": relin,
+            **dict(zip(("tip_x", "tip_y"), values["tip"], strict=True)),
+            "energy": values["energy"],
+            **dict(zip(("force_x", "force_y"), values["contact_force"], strict=True)),
+        }
 
 
 def pressures(plan: Plan, solve: Reference) -> Rows:
@@ -94,21 +60,18 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
     ds over the arc, the force is the magnitude ‖(Bᵀλ)_j‖ of the contact force on the
     node, and the pressure is force per length.
     """
-    bodies = model(plan.scaling[-1], plan.Nh, 2 * plan.Nh, "strain")
-    inverse = factorise_clamped(bodies)
-    slave = bodies.pairs[0].slave
-    points = bodies.mesh.points[slave]
-    angles = np.degrees(np.arctan2(points[:, 1], points[:, 0] - 1.0))
-    lengths = nodal_lengths(points)
+    keys = {"Nr": plan.scaling[-1], "Nh": plan.Nh, "steps": plan.steps}
     for contact in ("nts", "mortar"):
-        linearise = linearisation(bodies, contact, "dual")
-        path = _path(bodies, linearise, inverse, solve, plan.steps)
         for step in range(1, plan.steps + 1):
-            chosen = path.problem(step)
-            pushed = chosen.problem.primal.G.T @ recovered(chosen).z
-            on_nodes = pushed.reshape(-1, 2)[slave]
-            forces = np.hypot(*on_nodes.T) * bodies.force
-            columns = zip(angles, lengths, forces, strict=True)
+            more = {"step": step, "contact": contact}
+            case = _case(BeamRing(), {**keys, **more}, solve, "dual-bounds")
+            assert case.fields is not None
+            fields = case.fields(solve(case.qp))
+            (side,) = fields.contacts
+            points = fields.points[side.nodes]
+            angles = np.degrees(np.arctan2(points[:, 1], points[:, 0] - 1.0))
+            forces = np.hypot(*side.force.T)
+            columns = zip(angles, nodal_lengths(points), forces, strict=True)
             for node, (angle, length, force) in enumerate(columns):
                 yield {
                     "contact": contact,
@@ -132,20 +95,22 @@ def verification(plan: Plan, solve: Reference) -> Rows:
     for contact, keys in ROWS.items():
         for upper in plan.patch:
             params = {"upper": upper, "lower": upper + upper // 2, **keys}
-            error = _error(ContactPatch(), params, "stress_error", solve)
+            error = _quantities(ContactPatch(), params, solve)["stress_error"]
             yield {"problem": "patch", "contact": contact, "n": upper, "error": error}
         for n in plan.hertz:
             params = {"n": n, "m": max(3 * n // 4, 1), **keys}
-            error = _error(HertzCylinder(), params, "pressure_l2_error", solve)
+            error = _quantities(HertzCylinder(), params, solve)["pressure_l2_error"]
             yield {"problem": "hertz", "contact": contact, "n": n, "error": error}
 
 
-def _error(
-    family: ContactPatch | HertzCylinder,
-    keys: Mapping[str, Value],
-    name: str,
-    solve: Reference,
-) -> float:
-    params: dict[str, Any] = {**family.defaults, **keys}
-    case = family.build("dual", params, solve)
-    return float(case.quantities(solve(case.qp))[name])
+def _quantities(
+    family: Family, keys: Mapping[str, Value], solve: Reference, form: str = "dual"
+) -> Mapping[str, Any]:
+    case = _case(family, keys, solve, form)
+    return case.quantities(solve(case.qp))
+
+
+def _case(
+    family: Family, keys: Mapping[str, Value], solve: Reference, form: str
+) -> Case:
+    return family.build(form, family.complete(keys), solve)
