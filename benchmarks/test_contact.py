@@ -5,11 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from mortarbench.problems.contact.closest import closest_points, divided
 from mortarbench.problems.contact.face_mortar import face_mortar
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_facet import node_to_facet
-from mortarbench.problems.contact.surface import surface
+from mortarbench.problems.contact.surface import closest_points, divided, surface
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,

@@ -47,7 +47,6 @@ from scipy.sparse import csr_array, vstack
 from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.closest import Simplices, divided
 from mortarbench.problems.contact.mortar import Basis
 from mortarbench.problems.contact.rows import (
     ContactRows,
@@ -58,7 +57,9 @@ from mortarbench.problems.contact.rows import (
 from mortarbench.problems.contact.surface import (
     Points,
     Reach,
+    Simplices,
     current_surface,
+    divided,
     tangents,
 )
 from mortarbench.problems.fem.mesh import Nodes

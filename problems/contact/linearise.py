@@ -16,7 +16,6 @@ from mortarbench.problems.contact.bodies import (
     ContactSides,
     UnassembledBodies,
 )
-from mortarbench.problems.contact.closest import closest_points, divided
 from mortarbench.problems.contact.face_mortar import face_mortar
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.mortar import mortar
@@ -30,8 +29,10 @@ from mortarbench.problems.contact.sides import pair_names
 from mortarbench.problems.contact.surface import (
     Points,
     Reach,
+    closest_points,
     current_positions,
     current_surface,
+    divided,
 )
 from mortarbench.problems.fem.mesh import Nodes
 

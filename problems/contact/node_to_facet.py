@@ -38,14 +38,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.closest import (
-    SAME_POINT,
-    ClosestPoints,
-    Simplices,
-    closest_points,
-    divided,
-    projected,
-)
 from mortarbench.problems.contact.face_mortar import face_mortar
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.rows import (
@@ -55,9 +47,15 @@ from mortarbench.problems.contact.rows import (
     with_integrals,
 )
 from mortarbench.problems.contact.surface import (
+    SAME_POINT,
+    ClosestPoints,
     Points,
+    Simplices,
+    closest_points,
     current_positions,
     current_surface,
+    divided,
+    projected,
     tangents,
 )
 from mortarbench.problems.fem.elements import cross

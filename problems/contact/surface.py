@@ -2,14 +2,22 @@
 
 In 2D, facets are the segments of a chain of nodes; in 3D, facets are the faces of
 cells.
+
+For closest points, facets are divided into simplices, on which shape functions are
+linear. A segment is a simplex; a quadrilateral face is divided into four triangles
+about the mean of its corners, with shape functions that are ¼ at the centre. Thus the
+surface is continuous, and integrals over overlaps of two sides are exact. On plane
+faces, the integrals ∫N_j equal those of the bilinear shape functions.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_areas
@@ -21,6 +29,20 @@ Points = NDArray[np.float64]  #: (…, dim) positions in m, or dimensionless vec
 #: area below this fraction of the largest one, and sums of unit normals shorter than
 #: this value count as zero
 MIN_RELATIVE_LENGTH = 1e-12
+_CORNERS = np.eye(4)
+#: (4, 3, 4) shape functions at the vertices of the triangles of a quadrilateral
+_QUAD = np.array(
+    [[_CORNERS[k], _CORNERS[(k + 1) % 4], np.full(4, 0.25)] for k in range(4)]
+)
+#: (3, 4) shape functions at the vertices of a triangular face, which is stored with its
+#: last corner repeated
+_TRIANGLE = _CORNERS[:3]
+#: the closest points on two facets are the same point of a common border if their
+#: distance, relative to the radius of a facet, is below this value; closest points
+#: within this distance, in barycentric coordinates, of a vertex are moved to the vertex
+SAME_POINT = 1e-9
+#: relative tolerance for rounding of distances
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,3 +244,184 @@ def unit(vectors: Points, otherwise: Points) -> Points:
     length = np.sqrt(np.einsum("...x,...x->...", vectors, vectors))[..., None]
     vanishes = length <= MIN_RELATIVE_LENGTH
     return np.where(vanishes, otherwise, vectors / np.where(vanishes, 1.0, length))
+
+
+class ClosestPoints(NamedTuple):
+    """Closest points of s positions on a contact side."""
+
+    facet: Nodes  #: (s,) facet that contains the closest point
+    simplex: Nodes  #: (s,) simplex of this facet
+    N: NDArray[np.float64]  #: (s, c) shape functions of the facet at the closest point
+    normal: Points  #: (s, dim) outward unit normal of the side at the closest point
+    #: (s,) distance along the side by which a point is beyond its border, m; else 0
+    beyond: Vector
+
+
+class Simplices(NamedTuple):
+    """Simplices of the facets of a contact side, with dim vertices each."""
+
+    surface: Surface
+    centre: Points  #: (f, dim) means of the corners of each facet, m
+    radius: Vector  #: (f,) largest distance of a corner from the centre, m
+    number: Nodes  #: (f,) number of simplices of each facet, 1 or 4
+    facet: Nodes  #: (t,) facet of each simplex, ascending
+    #: (t, dim, c) shape functions of the facet at the vertices of the simplex
+    shape: NDArray[np.float64]
+    vertices: Points  #: (t, dim, dim) positions of the vertices, m
+
+    @property
+    def normals(self) -> Points:
+        """Unit normals of the simplices, (t, dim)."""
+        if self.vertices.shape[1] == 2:
+            return self.surface.normal
+        a, b = (self.vertices[:, k] - self.vertices[:, 0] for k in (1, 2))
+        return unit_vectors(np.cross(a, b))
+
+    @property
+    def border(self) -> NDArray[np.bool_]:
+        """Mask (t, dim) of the borders of simplices that bound a single facet.
+
+        In 3D, border k is the edge from vertex k to k + 1. In 2D, it is vertex k, and
+        only the two ends of the chain bound a single segment.
+        """
+        facets = self.surface.facets
+        if facets.shape[1] == 2:
+            ends = np.zeros(facets.shape, dtype=bool)
+            ends[0, 0] = ends[-1, 1] = True
+            return ends
+        node = np.take_along_axis(facets[self.facet], self.shape.argmax(axis=2), axis=1)
+        node[self.shape.max(axis=2) < 1] = -1  # the centre of a quadrilateral
+        low, high = np.sort(np.stack([node, np.roll(node, -1, axis=1)]), axis=0)
+        edge = low * len(self.surface.x) + high
+        _, place, count = np.unique(edge, return_inverse=True, return_counts=True)
+        once = (count == 1)[place].reshape(edge.shape)
+        return np.asarray(once & (low >= 0))
+
+    def of_facets(self, facets: Nodes) -> tuple[Nodes, Nodes]:
+        """Return the simplices (k,) of the given facets (p,).
+
+        The second result (k,) is the index in `facets` of the facet of each simplex.
+        """
+        count = self.number[facets]
+        place = np.repeat(np.arange(len(facets)), count)
+        offset = np.arange(len(place)) - np.repeat(np.cumsum(count) - count, count)
+        return np.searchsorted(self.facet, facets)[place] + offset, place
+
+
+def divided(surface: Surface) -> Simplices:
+    """Divide the facets of a surface into simplices."""
+    facets = surface.facets
+    is_quad = facets[:, -2] != facets[:, -1]
+    number, at = np.ones(len(facets), dtype=np.int64), surface.x[facets]
+    centre, shape = at.mean(axis=1), np.broadcast_to(np.eye(2), (len(facets), 2, 2))
+    if facets.shape[1] > 2:
+        number[is_quad] = 4
+        centre = np.where(is_quad[:, None], centre, at[:, :3].mean(axis=1))
+    facet = np.repeat(np.arange(len(number)), number)
+    if facets.shape[1] > 2:
+        k = np.arange(len(facet)) - np.repeat(np.cumsum(number) - number, number)
+        shape = np.where(is_quad[facet, None, None], _QUAD[k], _TRIANGLE)
+    radius = np.linalg.norm(at - centre[:, None], axis=2).max(axis=1)
+    vertices = np.einsum("tvc,tcx->tvx", shape, at[facet])
+    return Simplices(surface, centre, radius, number, facet, shape, vertices)
+
+
+def closest_points(x: Points, side: Simplices) -> ClosestPoints:
+    """Return the closest points of x (s, dim) on a side, with outward normals.
+
+    If several facets are equally close up to rounding, the first one is selected.
+    """
+    tree = KDTree(side.centre)
+    # `nearest` is the distance to the closest centre of a facet. Facets contain their
+    # centres, so the distance to the closest point is at most `nearest`. The distance
+    # to the centre of the facet that contains this point is larger by at most the
+    # radius of the facet
+    nearest, _ = tree.query(x)
+    reach = nearest * (1 + SAME_POINT) + side.radius.max()
+    found = tree.query_ball_point(x, reach, return_sorted=True)
+    candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
+    t, pair = side.of_facets(candidate)
+    count = np.array([len(k) for k in found])
+    node = np.repeat(np.arange(len(x)), count)[pair]
+    coordinates = closest_in_simplices(x[node], side.vertices[t])
+    at = np.einsum("pv,pvx->px", coordinates, side.vertices[t])
+    distance = np.linalg.norm(at - x[node], axis=1)
+    first = np.flatnonzero(np.diff(node, prepend=-1))
+    least = np.minimum.reduceat(distance, first)[node]
+    close = np.flatnonzero(distance <= least * (1 + ROUNDING))
+    best = close[np.unique(node[close], return_index=True)[1]]
+    # average the normals of all facets that meet at the closest point
+    same = np.linalg.norm(at - at[best][node], axis=1)
+    meets = same <= SAME_POINT * side.radius[side.facet[t]]
+    touching = np.unique(np.stack([node, side.facet[t]])[:, meets], axis=1)
+    total = np.zeros_like(x)
+    np.add.at(total, touching[0], side.surface.normal[touching[1]])
+    facet = side.facet[t[best]]
+    normal = unit(total, side.surface.normal[facet])
+    # components of x − x_c outwards, along the facets whose border contains x_c
+    vertices = side.vertices[t]
+    edges = np.roll(vertices, -1, axis=1) - vertices
+    if x.shape[1] == 2:
+        outwards = -unit_vectors(edges)  # away from the other vertex
+    else:
+        outwards = unit_vectors(np.cross(edges, side.normals[t, None]))
+    opposite = np.roll(coordinates, 1 - x.shape[1], axis=1)
+    on_border = side.border[t] & (opposite <= 0) & meets[:, None]
+    excess = np.einsum("pkx,px->pk", outwards, x[node] - at)
+    excess[~on_border | (excess <= SAME_POINT * side.radius[side.facet[t], None])] = 0
+    beyond = np.zeros(len(x))
+    np.maximum.at(beyond, node, excess.max(axis=1))
+    # snap to vertices, so that rows do not depend on the rounding of coordinates
+    inner = np.where(coordinates[best] <= SAME_POINT, 0.0, coordinates[best])
+    inner = np.where(inner >= 1 - SAME_POINT, 1.0, inner)
+    N = np.einsum("sv,svc->sc", inner, side.shape[t[best]])
+    return ClosestPoints(facet, t[best], N, normal, beyond)
+
+
+def projected(x: Points, simplex: Points) -> NDArray[np.float64]:
+    """Return barycentric coordinates (p, dim) of the projections of x (p, dim).
+
+    Points are projected onto the lines (2D) or planes (3D) of the simplices.
+
+    simplex : (p, dim, dim) vertices
+    """
+    edges = np.roll(simplex, -1, axis=1) - simplex  # edge k from vertex k to k + 1
+    offset = x[:, None] - simplex
+    if x.shape[1] == 2:
+        square = np.einsum("px,px->p", edges[:, 0], edges[:, 0])
+        along = np.einsum("px,px->p", offset[:, 0], edges[:, 0]) / square
+        return np.stack([1 - along, along], axis=-1)
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    square = np.einsum("px,px->p", normal, normal)[:, None]
+    # the barycentric coordinate of vertex k + 2 is the area over edge k
+    parts = np.einsum("pkx,px->pk", np.cross(edges, offset), normal) / square
+    return np.roll(parts, 2, axis=1)
+
+
+def closest_in_simplices(x: Points, simplex: Points) -> NDArray[np.float64]:
+    """Return barycentric coordinates (p, dim) of the closest points of x (p, dim).
+
+    In a triangle, the closest point is the foot of the perpendicular if the foot is
+    inside, and otherwise the closest point of the nearest edge.
+
+    simplex : (p, dim, dim) vertices
+    """
+    foot = projected(x, simplex)
+    if x.shape[1] == 2:
+        return np.clip(foot, 0.0, 1.0)
+    edges = np.roll(simplex, -1, axis=1) - simplex  # edge k from vertex k to k + 1
+    offset = x[:, None] - simplex
+    length = np.einsum("pkx,pkx->pk", edges, edges)
+    along = np.clip(np.einsum("pkx,pkx->pk", offset, edges) / length, 0.0, 1.0)
+    away = offset - along[..., None] * edges
+    k = np.einsum("pkx,pkx->pk", away, away).argmin(axis=1)
+    p = np.arange(len(x))
+    on_edge = np.zeros((len(x), 3))
+    on_edge[p, k], on_edge[p, (k + 1) % 3] = 1 - along[p, k], along[p, k]
+    inside = np.asarray((foot >= 0).all(axis=1))
+    return np.where(inside[:, None], foot, on_edge)
+
+
+def unit_vectors(v: Points) -> Points:
+    """Normalise vectors (…, dim)."""
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

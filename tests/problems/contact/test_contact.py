@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.problems.contact import closest as contact
-from mortarbench.problems.contact.closest import divided
+from mortarbench.problems.contact import surface as contact
 from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.rows import rows_along
-from mortarbench.problems.contact.surface import surface
+from mortarbench.problems.contact.surface import divided, surface
 
 #: master below the slave; its chain runs from right to left, so that the body is below
 MASTER = np.array([[4.0, 0.0], [2.0, 0.0], [0.0, 0.0]])

@@ -6,10 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mortarbench.problems.contact.closest import closest_points, divided
 from mortarbench.problems.contact.mortar import _dual, cast_rays, mortar, overlaps
 from mortarbench.problems.contact.node_to_facet import node_to_facet
-from mortarbench.problems.contact.surface import Reach, surface
+from mortarbench.problems.contact.surface import Reach, closest_points, divided, surface
 
 
 def searched(**drawn):

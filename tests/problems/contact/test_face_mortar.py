@@ -7,14 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mortarbench.harness import InputError
-from mortarbench.problems.contact.closest import divided
 from mortarbench.problems.contact.face_mortar import (
     clip,
     face_mortar,
     moments,
     overlaps,
 )
-from mortarbench.problems.contact.surface import Reach, current_surface
+from mortarbench.problems.contact.surface import Reach, current_surface, divided
 
 
 def exact_overlap(subject, window):

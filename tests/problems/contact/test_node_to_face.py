@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mortarbench.problems.contact.closest import (
+from mortarbench.problems.contact.node_to_facet import node_to_facet
+from mortarbench.problems.contact.surface import (
     closest_in_simplices,
     closest_points,
     divided,
+    faceted_surface,
 )
-from mortarbench.problems.contact.node_to_facet import node_to_facet
-from mortarbench.problems.contact.surface import faceted_surface
 
 
 def test_closest_points_of_triangles_are_those_of_a_fine_search(rng):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.problems.contact.closest import closest_points, divided
 from mortarbench.problems.contact.mortar import facing_segments
-from mortarbench.problems.contact.surface import Reach, surface
+from mortarbench.problems.contact.surface import Reach, closest_points, divided, surface
 
 
 def all_pairs(x, chain):
