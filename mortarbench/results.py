@@ -19,7 +19,6 @@ from mortarbench.harness.errors import shown as given
 from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, toml
 from mortarbench.harness.record import REFUTED, Record, Verdict
 from mortarbench.harness.registry import is_solver, resolve
-from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import keep_environment, refuse_links
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.running.progress import Progress
@@ -115,9 +114,12 @@ class Results:
             cases = "case" if count == 1 else "cases"
             names = some(self.missing.unbuilt)
             lines.append(f"{count} {cases} could not be built: {names}")
-        if self.missing.faults:
-            faults = in_words(self.missing.faults)
-            lines.append(f"{faults}; the same command tries again")
+        if faults := self.missing.faults:
+            measured = f"{len(faults)} measurement{'s' * (len(faults) != 1)}"
+            lines.append(
+                f"{measured} failed for reasons other than the solver: {some(faults)}; "
+                "the same command tries again"
+            )
         return lines
 
     def report(self, **options: object) -> Report:

@@ -25,7 +25,6 @@ from mortarbench.harness.files.reading import (
     read_json,
     toml,
 )
-from mortarbench.harness.results.faults import FAULTS
 from mortarbench.harness.suite.growth import incompatibility
 from mortarbench.harness.suite.suite import Suite, SuiteFile, read_stored, suite_file
 
@@ -33,8 +32,8 @@ from mortarbench.harness.suite.suite import Suite, SuiteFile, read_stored, suite
 #: overwrites only these and those in `_RESULT_FILES`.
 _FOLDERS = ("journal", "vectors", "cases", "environments", "report")
 _FILES = ("environment.json", "suite.toml")
-#: results of `mortarbench validate`, and faults of runs
-_RESULT_FILES = ("validation.json", FAULTS)
+#: results of `mortarbench validate`
+_RESULT_FILES = ("validation.json",)
 REMEDY = "choose another --out or use --fresh"
 MAX_FOLDER_DEPTH = 30  #: largest depth of nested folders; runs write three levels
 #: parts of an environment that describe the machine and its threads
@@ -46,7 +45,6 @@ _SCRATCH = ".scratch"
 #: beginnings of the names of files in the result folder itself
 _FILE_PREFIXES = (
     _LOCK,
-    FAULTS,
     "environment.",
     "suite.",
     "validation.",
@@ -146,65 +144,13 @@ def refuse_foreign(folder: Path) -> None:
         )
 
 
-class FolderLock:
-    """Exclusive lock of a result folder.
-
-    Raises
-    ------
-    InputError
-        If another run has locked the folder.
-    OSError
-        If the folder cannot be created or written.
-
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._take()
-
-    def is_there(self) -> bool:
-        """Return True if the folder still exists, False if it had been deleted.
-
-        If the folder or its lock was deleted, it is created and locked again.
-
-        Raises
-        ------
-        InputError
-            If the folder was moved, or if another run has locked a new folder at its
-            path.
-
-        """
-        is_there = _is_same_file(self._folder, self._folder_fd)
-        if not is_there:
-            path = os.readlink(f"/proc/self/fd/{self._folder_fd}")
-            if not path.endswith(" (deleted)"):
-                raise InputError(
-                    f"{self._folder} was moved to {path} while the run wrote to it; "
-                    "all measurements are there, and --out with that path continues"
-                )
-        if not (is_there and _is_same_file(self._folder / _LOCK, self._lock)):
-            self.close()
-            self._take()
-        return is_there
-
-    def _take(self) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        self._lock = _open_lock(self._folder)
-        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-        self._folder_fd = os.open(self._folder, flags)
-
-    def close(self) -> None:
-        """Release the lock."""
-        for name in ("_lock", "_folder_fd"):
-            if (fd := vars(self).pop(name, None)) is not None:
-                os.close(fd)
-
-
 @contextmanager
-def lock_folder(folder: Path) -> Iterator[FolderLock]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Lock a result folder within the block; create the folder if necessary.
 
-    Unfinished files that killed runs left in the folder are deleted.
+    The content of the lock file identifies a result folder, even if the run is killed
+    before it has written any other file. Unfinished files that killed runs left in the
+    folder are deleted.
 
     Raises
     ------
@@ -212,57 +158,31 @@ def lock_folder(folder: Path) -> Iterator[FolderLock]:
         If another run has locked the folder, or the folder cannot be written.
 
     """
+    # O_NOFOLLOW: if the lock were a link, another file would be overwritten
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     try:
         with report_full_disk(folder):
-            lock = FolderLock(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = os.open(folder / _LOCK, flags, 0o666)
     except OSError as e:
         raise InputError(
             f"{folder}: {e.strerror}; expected a folder that can be written"
         ) from None
     try:
-        # Unfinished files are deleted after locking, since another run may still have
-        # been writing them.
-        folders = [folder / name for name in _FOLDERS]
-        remove_unfinished(folder, folders)
-        yield lock
-    finally:
-        lock.close()
-
-
-def _open_lock(folder: Path) -> int:
-    """Lock a folder until the returned file descriptor is closed.
-
-    The content of the lock file identifies a result folder, even if the run is killed
-    before it has written any other file.
-    """
-    # O_NOFOLLOW: if the lock were a link, another file would be overwritten
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    while True:  # repeat until the file at the path is the locked file
-        fd = os.open(folder / _LOCK, flags, 0o666)
         try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # the file may have been deleted between open and flock
-            if _is_same_file(folder / _LOCK, fd):
-                os.pwrite(fd, _LOCK_CONTENT, 0)
-                return fd
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            os.close(fd)
             raise InputError(
                 f"{folder} is being written by another run; wait, or choose another "
                 "folder"
             ) from None
-        except BaseException:
-            os.close(fd)
-            raise
-        os.close(fd)
-
-
-def _is_same_file(path: Path, fd: int) -> bool:
-    """Return True if a path leads to the open file or folder of a descriptor."""
-    try:
-        return os.path.samestat(path.stat(), os.fstat(fd))
-    except FileNotFoundError:
-        return False
+        os.pwrite(lock, _LOCK_CONTENT, 0)
+        # Unfinished files are deleted after locking, since another run may still have
+        # been writing them.
+        remove_unfinished(folder, [folder / name for name in _FOLDERS])
+        yield
+    finally:
+        os.close(lock)
 
 
 @contextmanager
@@ -295,17 +215,8 @@ def claim(
             shutil.rmtree(out / name, ignore_errors=True)
         for name in _RESULT_FILES:
             (out / name).unlink(missing_ok=True)
-    describe(out, suite, environment)
-
-
-def describe(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
-    """Write the suite and the environment to a locked folder.
-
-    environment : environment, with its digest under the key ``digest``
-    """
     replace_file(out / "suite.toml", suite.text.encode())
-    text = json.dumps(environment, indent=1) + "\n"
-    replace_file(out / "environment.json", text.encode())
+    write_json(out / "environment.json", environment)
 
 
 def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> bool:
@@ -382,8 +293,12 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
 
 def keep_environment(folder: Path, digest: str, environment: Mapping[str, Any]) -> None:
     """Store an environment, such as that of a cluster node, under its digest."""
-    text = json.dumps({"digest": digest, **environment}, indent=1) + "\n"
-    replace_file(_node_file(folder, digest), text.encode())
+    write_json(_node_file(folder, digest), {"digest": digest, **environment})
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write data to a JSON file with `replace_file`."""
+    replace_file(path, (json.dumps(data, indent=1) + "\n").encode())
 
 
 def _node_file(folder: Path, digest: str) -> Path:

@@ -1,45 +1,44 @@
 """Journal of a result folder: append-only, with one fsynced line per measurement.
 
 If a process is killed while it writes, the journal ends with a partial line. Readers
-ignore the partial line, and the next writer removes it.
+ignore the partial line, and the next writer removes it. Readers limit the size of a
+file and the length of its lines.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
-from mortarbench.harness.errors import InputError, shown, some
-from mortarbench.harness.files.lines import Lines, read_lines
+from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.files.datafile import opened
+from mortarbench.harness.files.durable import sync_folder
 from mortarbench.harness.record import Record
 from mortarbench.harness.results.folder import refuse_links
+
+#: length of the longest line that is read, which bounds the required memory
+MAX_LINE_BYTES = 2**24
 
 
 class Journal:
     """Writer of a file ``FOLDER/journal/NAME.jsonl``.
 
     The folder must be locked by `harness.results.folder.lock_folder` while the writer
-    is open, because a second writer could truncate an incomplete line. All files of the
-    journal are kept open, so that a file can be restored if it is deleted.
-
-    restored : called with a message of one line if a file was restored
+    is open, because a second writer could truncate an incomplete line.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        name: str,
-        restored: Callable[[str], None] = lambda _: None,
-    ) -> None:
-        own = folder / "journal" / f"{name}.jsonl"
-        others = sorted({*own.parent.glob("*.jsonl")} - {own})
-        self._files = ExitStack()
-        self._own, *self._others = (
-            self._files.enter_context(Lines(path, restored)) for path in (own, *others)
-        )
+    def __init__(self, folder: Path, name: str) -> None:
+        self._path = folder / "journal" / f"{name}.jsonl"
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        lines = read_lines(self._path) if self._path.exists() else ()
+        self._size = sum(map(len, lines))  #: number of bytes of whole lines
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+        self._fd = os.open(self._path, flags, 0o666)
+        os.ftruncate(self._fd, self._size)
+        sync_folder(self._path.parent)
 
     def append(self, record: Record) -> None:
         """Append a record, and flush its line to the disk.
@@ -49,31 +48,74 @@ class Journal:
         Raises
         ------
         InputError
-            If another program writes to the journal.
+            If `check` refuses the file.
         OSError
             If writing fails, for instance on a full disk.
 
         """
-        self.restore()
-        self._own.append(record.to_json())
+        self.check()
+        whole = f"{record.to_json()}\n".encode()
+        line = memoryview(whole)
+        try:
+            while line:  # if the disk is nearly full, a write may be incomplete
+                line = line[os.write(self._fd, line) :]
+            os.fsync(self._fd)
+        except OSError:
+            os.ftruncate(self._fd, self._size)
+            raise
+        self._size += len(whole)
 
-    def restore(self) -> None:
-        """Restore files that were deleted since they were opened.
+    def check(self) -> None:
+        """Check that no other program has moved, deleted or changed the file.
 
         Raises
         ------
         InputError
-            If another program writes to the journal.
+            If the file is not at its path, or has another size.
 
         """
-        for file in (self._own, *self._others):
-            file.restore()
+        there = self._path.stat() if self._path.is_file() else None
+        held = os.fstat(self._fd)
+        if there is None or not os.path.samestat(there, held):
+            change = "moved or deleted"
+        elif held.st_size != self._size:
+            change = "changed"
+        else:
+            return
+        raise InputError(
+            f"{self._path} was {change} by another program during the run; the same "
+            "command continues with the lines that are there"
+        )
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self._files.__exit__(*error)
+        os.close(self._fd)
+
+
+def read_lines(path: Path) -> Iterator[bytes]:
+    """Yield the whole lines of a journal, each with its newline.
+
+    Raises
+    ------
+    InputError
+        If the file is not a regular file, is larger than `harness.files.datafile`
+        allows, or has a line longer than `MAX_LINE_BYTES`.
+
+    """
+    with opened(path, "a journal") as file:
+        for number in count(1):
+            line = file.readline(MAX_LINE_BYTES)
+            if line.endswith(b"\n"):
+                yield line
+            elif len(line) < MAX_LINE_BYTES:
+                return
+            else:
+                raise InputError(
+                    f"{path}, line {number}: longer than {MAX_LINE_BYTES >> 20} MiB; "
+                    "expected a journal written by a run"
+                )
 
 
 def read_journal(
@@ -81,9 +123,8 @@ def read_journal(
 ) -> list[Record]:
     """Read all records of a result folder, in the order of file names and lines.
 
-    Every measurement, which session and run_id identify, occurs once in the result: a
-    line is skipped if its record equals an earlier record. Equal strings and tables of
-    different records in one file are stored only once in memory.
+    A line that equals an earlier line is skipped. Equal texts and tables of different
+    records in one file are stored only once in memory.
 
     tell : called with a message of one line if lines are skipped
 
@@ -102,41 +143,28 @@ def read_journal(
     paths = sorted((folder / "journal").glob("*.jsonl"))
     if not paths:
         raise InputError(f"no journal in {folder}; expected journal/*.jsonl there")
-    records: list[Record] = []
-    at: dict[str, int] = {}  # index in the result by identity
-    repeated = []
+    records: dict[str, Record] = {}
+    repeated = 0
     for path in paths:
         for number, record in _records(path):
-            first = at.setdefault(record.identity, len(records))
-            if first == len(records):
-                records.append(record)
-                continue
-            repeated.append(f"{path}, line {number}")
-            if record != records[first]:
-                place = next(
-                    f"{path}, line {number}"
-                    for path in paths
-                    for number, other in _records(path)
-                    if other.identity == record.identity
-                )
+            first = records.setdefault(record.identity, record)
+            repeated += first is not record
+            if first != record:
                 raise InputError(
-                    f"{repeated[-1]}: the record of run_id {shown(record.run_id)} "
-                    f"differs from the record at {place}; expected one line per "
-                    "run_id and session; delete the wrong line"
+                    f"{path}, line {number}: differs from an earlier record of run_id "
+                    f"{shown(record.run_id)}; expected one line per run_id and "
+                    "session; delete the wrong line"
                 )
     if repeated:
-        lines = "line repeats" if len(repeated) == 1 else "lines repeat"
-        tell(
-            f"{len(repeated)} journal {lines} an earlier line exactly, and count "
-            f"once: {some(repeated)}"
-        )
-    return records
+        lines = "line repeats" if repeated == 1 else "lines repeat"
+        tell(f"{repeated} journal {lines} an earlier line exactly, and count once")
+    return [*records.values()]
 
 
 def _records(path: Path) -> Iterator[tuple[int, Record]]:
     """Yield the line number and the record of each line of a file."""
-    shared: dict[Any, Any] = {}
-    for number, line in enumerate(read_lines(path, "a journal"), 1):
+    shared: dict[str, Any] = {}
+    for number, line in enumerate(read_lines(path), 1):
         try:
             yield number, Record.from_json(line, shared)
         except ValueError as e:

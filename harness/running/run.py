@@ -10,25 +10,20 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.files.durable import report_full_disk
-from mortarbench.harness.files.lines import Lines
 from mortarbench.harness.files.store import save
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.termination import TerminatedError, ended_by_signals
 from mortarbench.harness.record import Record, finite
 from mortarbench.harness.registry import SolverSpec, options_of
-from mortarbench.harness.results.faults import FAULTS, Fault
 from mortarbench.harness.results.folder import (
     REMEDY,
-    FolderLock,
     claim,
-    describe,
     lock_folder,
     refuse_foreign,
     refuse_other,
@@ -57,8 +52,8 @@ class Missing:
     """Measurements that are missing after a run; the same command repeats them."""
 
     unbuilt: list[str]  #: names of the cases that could not be built
-    #: faults of the harness or the machine that prevented measurements
-    faults: list[Fault]
+    #: measurements prevented by faults of the harness or the machine, with the reasons
+    faults: list[str]
 
 
 def run(
@@ -99,7 +94,7 @@ def run(
         ended_by_signals(),
         _continuation_told(progress),
         report_full_disk(out),
-        lock_folder(out) as lock,
+        lock_folder(out),
     ):
         options = {s.label: options_of(resolve(s)) for s in suite.solvers}
         past: list[Record] = []
@@ -113,7 +108,7 @@ def run(
         claim(out, suite, environment, fresh=fresh)
         with (
             scratch_in(out) as scratch,
-            Journal(out, digest, progress.warn) as journal,
+            Journal(out, digest) as journal,
         ):
             schedule = Schedule(
                 suite=suite,
@@ -127,7 +122,6 @@ def run(
             progress.start(schedule.cells)
             recorder = _Recorder(
                 out=out,
-                lock=lock,
                 journal=journal,
                 schedule=schedule,
                 progress=progress,
@@ -135,14 +129,6 @@ def run(
             with engine(commands, scratch, out.resolve() / "cases") as execute:
                 for outcome in execute(schedule.blocks()):
                     recorder.take(outcome)
-                    if recorder.was_deleted:
-                        describe(out, suite, environment)
-                        journal.restore()
-                        raise InputError(
-                            f"{out} was deleted while the run wrote to it; its journal "
-                            "was restored, solutions stored before are lost; the same "
-                            "command continues"
-                        )
         return Missing(unbuilt=schedule.unbuilt, faults=recorder.remaining_faults())
 
 
@@ -151,13 +137,11 @@ class _Recorder:
     """Writer that stores each outcome of an engine once and reports progress."""
 
     out: Path
-    lock: FolderLock
     journal: Journal
     schedule: Schedule
     progress: Progress
-    was_deleted: bool = False  #: True if the last outcome came after the folder's end
     _counted: set[str] = field(default_factory=set)  # run IDs reported to `progress`
-    _faults: dict[str, Fault] = field(default_factory=dict)  # last fault by run ID
+    _faults: dict[str, str] = field(default_factory=dict)  # last fault by run ID
 
     def take(self, outcome: Outcome) -> None:
         """Store one result, or the reason why it is missing.
@@ -165,12 +149,14 @@ class _Recorder:
         Raises
         ------
         InputError
-            If the folder has been moved, or another run has locked it.
+            If another program has moved, deleted or changed the journal.
         OSError
             If the result cannot be written, for instance because the disk is full; the
             journal then has no line for this result.
 
         """
+        # if the folder was moved, solutions would be stored in a new folder
+        self.journal.check()
         match outcome:
             case BuildFailure():
                 _log.debug("%s\n%s", outcome.reason, outcome.trace)
@@ -187,7 +173,7 @@ class _Recorder:
             case Result():
                 self._take_result(outcome)
 
-    def remaining_faults(self) -> list[Fault]:
+    def remaining_faults(self) -> list[str]:
         """List the last fault of each measurement that is still missing."""
         return [
             fault
@@ -200,7 +186,6 @@ class _Recorder:
         if result.part:
             number = self.schedule.block_of_part(record.block, result.part)
             record = record.replace(block=number)
-        self.was_deleted = not self.lock.is_there()
         # Write the line last, because it must not refer to missing files.
         if result.point is not None:
             record = record.replace(vectors=save(self.out, result.point))
@@ -212,19 +197,9 @@ class _Recorder:
 
     def _take_fault(self, unmade: MeasurementFault) -> None:
         record, what = unmade.record, unmade.reason
-        fault = Fault(
-            time=datetime.now(UTC).isoformat(timespec="milliseconds"),
-            run_id=record.run_id,
-            case=record.case,
-            solver=record.solver,
-            what=what,
-            tried_again=unmade.tried_again,
-        )
-        self.was_deleted = not self.lock.is_there()
-        with Lines(self.out / FAULTS, self.progress.warn) as faults:
-            faults.append(fault.to_json())
+        fault = f"{record.solver} on {record.case}: {what}"
         then = "it is tried again" if unmade.tried_again else "it was not measured"
-        self.progress.warn(f"{record.solver} on {record.case}: {what}; {then}")
+        self.progress.warn(f"{fault}; {then}")
         if not unmade.tried_again:
             self._faults[record.run_id] = fault
             self._count(record, None)

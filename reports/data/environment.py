@@ -42,7 +42,6 @@ def by_environment(evidence: Evidence) -> tuple[Evidence, ...]:
             evidence,
             records=tuple(records[digest]),
             environment=found[digest],
-            faults=() if digest in places else evidence.faults,
             place=places.get(digest, ""),
             places=places,
         )

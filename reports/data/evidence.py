@@ -16,7 +16,6 @@ from mortarbench.harness import InputError, Record, Verdict
 from mortarbench.harness.errors import say, some
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.record import PROVEN, VERIFIED_FACTOR
-from mortarbench.harness.results.faults import Fault, read_faults, remaining_faults
 from mortarbench.harness.results.folder import environment_of, times_compare
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.running.pairs import Block
@@ -220,9 +219,6 @@ class Evidence:
     environment: Mapping[str, Any] = field(default_factory=dict)
     suite: Mapping[str, Any] = field(default_factory=dict)
     factor: float = VERIFIED_FACTOR  #: residuals of verified answers are ≤ factor·tol
-    faults: tuple[
-        Fault, ...
-    ] = ()  #: reasons for missing measurements that are not due to a solver
     #: name of the environment, if this is a part of the evidence from a further one
     place: str = ""
     #: names of all further environments of the folder, by digest
@@ -300,9 +296,6 @@ def read_evidence(
         environment=environment,
         suite=to_builtins(read_stored(suite)) if os.path.lexists(suite) else {},
         factor=factor,
-        faults=tuple(
-            remaining_faults(read_faults(directory), {r.run_id for r in records})
-        ),
     )
 
 

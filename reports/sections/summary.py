@@ -7,7 +7,6 @@ from functools import partial
 
 from mortarbench.harness import InputError, Verdict
 from mortarbench.harness.record import PROVEN, VERIFIED_FACTOR
-from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import differences, environment_of
 from mortarbench.reports.data.environment import QUIET_LOAD, busy_with, machine
 from mortarbench.reports.data.evidence import Evidence, Outcome
@@ -47,7 +46,6 @@ def summary(a: Analysis) -> Iterator[Part]:
         tols=sorted({o.tol for o in evidence.flat}, reverse=True),
         sessions=len({r.session for r in evidence.records}),
         others=_others(evidence),
-        faults=in_words(evidence.faults),
         judged=sorted({r.accuracy for r in evidence.records if r.accuracy is not None}),
         load=busy_with(evidence),
         repeats=sorted({len(o.records) for o in tried}),

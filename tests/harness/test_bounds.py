@@ -129,8 +129,7 @@ def test_a_repeated_line_counts_once_and_is_reported(journal):
 
     assert [r.run_id for r in read_journal(folder, told.append)] == ["a", "b"]
     [line] = told
-    assert line.startswith("2 journal lines repeat an earlier line exactly, ")
-    assert "here.jsonl, line 3" in line
+    assert line == "2 journal lines repeat an earlier line exactly, and count once"
 
 
 def test_two_contradictory_lines_on_one_measurement_are_refused(journal):
@@ -138,10 +137,9 @@ def test_two_contradictory_lines_on_one_measurement_are_refused(journal):
 
     with pytest.raises(InputError) as e:
         read_journal(folder)
-    assert "line 3: the record of run_id 'a' differs from the record at " in str(
+    assert "here.jsonl, line 3: differs from an earlier record of run_id 'a'; " in str(
         e.value
     )
-    assert "here.jsonl, line 2; expected one line per run_id" in str(e.value)
 
 
 def test_a_report_mentions_repeated_lines_and_refuses_contradictory_ones(
@@ -153,8 +151,8 @@ def test_a_report_mentions_repeated_lines_and_refuses_contradictory_ones(
 
     folder = journal(record("a"), record("a", tol=1e-3))
     for command in ("report", "validate"):
-        assert "differs from the record at" in refused(command, folder)
-    assert "differs from the record at" in refused("replay", folder, "a")
+        assert "differs from an earlier record" in refused(command, folder)
+    assert "differs from an earlier record" in refused("replay", folder, "a")
 
 
 def test_equal_tables_of_a_journal_are_shared_but_1_and_true_differ(journal):

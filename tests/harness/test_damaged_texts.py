@@ -30,7 +30,6 @@ from mortarbench.harness.files.store import (
 )
 from mortarbench.harness.names import parse
 from mortarbench.harness.registry import SolverSpec
-from mortarbench.harness.results.faults import FAULTS
 from mortarbench.harness.results.folder import environment_of, refuse_other
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.solver_options import (
@@ -291,23 +290,6 @@ def without_none(data):
         case list():
             return [without_none(v) for v in data if v is not None]
     return data
-
-
-@COUNTS
-def test_damaged_faults_are_refused_or_reported(tmp_path, count):
-    chance = random.Random(count)
-    synthetic_results.write(tmp_path, 1, 1, 1)
-    fault = {
-        "time": "2026-01-01", "run_id": "a", "case": "c", "solver": "s", "what": "w",
-        "tried_again": False,
-    }  # fmt: skip
-    for i in range(count):
-        text = json.dumps(damaged_texts.distorted(fault, chance)) + "\n"
-        text = damaged_texts.damaged(text, chance) if chance.random() < 0.3 else text
-        written(tmp_path / FAULTS, text)
-        taken = tried(text, lambda: read_evidence(tmp_path))
-        if taken and i % 10 == 0:
-            assert tried(text, lambda: compose(read_evidence(tmp_path)))
 
 
 @COUNTS

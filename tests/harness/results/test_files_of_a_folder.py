@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 import mortarbench as mb
 from mortarbench.cli.main import main
 from mortarbench.harness import InputError
-from mortarbench.harness.files.lines import Lines
-from mortarbench.harness.results.faults import FAULTS, Fault
 from mortarbench.harness.results.folder import keep_environment
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
@@ -53,11 +51,6 @@ def folder_of_run(tmp_path_factory, svg_only):
     np.savez(folder.with_name("qp.npz"), P=np.eye(2), q=-np.ones(2), lb=np.zeros(2))
     suite.write_text(SUITE.format(folder.with_name("qp.npz")))
     results = mb.run(suite, out=folder)
-    fault = Fault(
-        time="", run_id="x", case="c", solver="s", what="w", tried_again=False
-    )
-    with Lines(folder / FAULTS, print) as lines:
-        lines.append(fault.to_json())
     mine = [r for r in results.records if r.solver == "smalbe"]
     (record,) = (r for r in mine if r.family == "contact-patch")
     keep_environment(folder, record.environment, {"machine": {}})
@@ -200,10 +193,11 @@ def but_slow(*kinds):
 
 
 @pytest.mark.parametrize("kind", but_slow(a_folder, empty))
-def test_faults_of_any_type_are_read_or_refused_by_every_command(
+def test_an_environment_of_any_type_is_read_or_refused_by_every_command(
     folder_of_run, tmp_path, kind, read_by_every_command
 ):
-    try_commands(folder_of_run, tmp_path, FAULTS, kind, read_by_every_command)
+    name = "environment.json"
+    try_commands(folder_of_run, tmp_path, name, kind, read_by_every_command)
 
 
 @pytest.mark.slow
@@ -214,7 +208,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
     names = kinds_of_files(folder_of_run)
     assert {name.partition("/")[0].partition(".")[0] for name in names} >= {
         "journal", "vectors", "cases", "report", "environments",
-        "environment", "suite", "faults", "validation", "",
+        "environment", "suite", "validation", "",
     }  # fmt: skip
     for i, name in enumerate(names):
         try_commands(

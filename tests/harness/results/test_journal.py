@@ -146,19 +146,43 @@ def test_a_path_that_is_not_a_folder_is_reported_as_missing_or_a_file(tmp_path):
         assert str(e.value) == f"{tmp_path / name}: {wrong}; expected a result folder"
 
 
-def test_a_journal_that_is_deleted_while_it_is_written_loses_nothing(tmp_path):
-    with Journal(tmp_path, "other") as other:
-        other.append(record("x"))
-    told = []
-    with Journal(tmp_path, "here", told.append) as journal:
+@pytest.mark.parametrize("change", ["delete", "move", "replace", "shorten", "extend"])
+def test_a_journal_that_another_program_changes_is_not_written(tmp_path, change):
+    file = tmp_path / "journal" / "here.jsonl"
+    with Journal(tmp_path, "here") as journal:
         journal.append(record("a"))
-        shutil.rmtree(tmp_path / "journal")
+        os.link(file, file.with_name("backup"))  # does not change the file
         journal.append(record("b"))
-        assert ids(tmp_path) == ["a", "b", "x"]
-        journal.append(record("c"))
+        content = file.read_bytes()
+        match change:
+            case "delete":
+                shutil.rmtree(file.parent)
+            case "move":
+                file.rename(tmp_path / "away")
+            case "replace":
+                file.unlink()
+                file.write_bytes(content)
+            case "shorten":
+                os.truncate(file, 5)
+            case "extend":
+                file.write_bytes(content + b"more\n")
+        with pytest.raises(InputError, match="by another program during the run"):
+            journal.append(record("c"))
 
-    assert ids(tmp_path) == ["a", "b", "c", "x"]
-    assert len(told) == 2
+    with Journal(tmp_path, "here") as journal:
+        if change != "extend":
+            journal.append(record("d"))
+    assert b"more" not in file.read_bytes() or change == "extend"
+
+
+@pytest.mark.parametrize("tail", [b"x", b"x" * 2**16, b"x" * 200_000, b""])
+def test_text_after_the_last_newline_is_removed_at_any_length(tmp_path, tail):
+    file = tmp_path / "journal" / "here.jsonl"
+    file.parent.mkdir()
+    for head in (b"", b"one\n", b"one\n" + b"y" * 2**16 + b"\n"):
+        file.write_bytes(head + tail)
+        with Journal(tmp_path, "here"):
+            assert file.read_bytes() == head
 
 
 def test_a_partially_written_record_is_not_in_the_journal(tmp_path):
