@@ -111,22 +111,21 @@ def replay(
     path, solvers = checked.result_folder("folder", folder), registries.solvers
     from mortarbench.harness.results.stored_run import open_stored_run, work_unit_of
     from mortarbench.harness.results.work_unit import BuildFailure, MeasurementFault
-    from mortarbench.harness.running.executor import local_engine
+    from mortarbench.harness.running.executor import execute
 
     stored = open_stored_run(path, run_id, registries.families, solvers)
     environment = registries.environment()
     unit = work_unit_of(stored, solvers, digest(environment))
     commands = registries.commands([stored.spec])
-    with (
-        TemporaryDirectory(prefix="mortarbench-") as scratch,
-        local_engine(
+    with TemporaryDirectory(prefix="mortarbench-") as scratch:
+        at = Path(scratch)
+        *_, result = execute(
+            iter([unit]),
             commands,
-            Path(scratch),
-            Path(scratch) / "cases",
+            at,
+            at / "cases",
             operators=registries.operators,
-        ) as execute,
-    ):
-        *_, result = execute(iter([unit]))
+        )
     if isinstance(result, BuildFailure):
         raise InputError(f"{stored.record.identity}: {result.reason}")
     if isinstance(result, MeasurementFault):

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-    from mortarbench.harness.results.work_unit import EngineFactory
+    from mortarbench.harness.results.work_unit import Execute
     from mortarbench.harness.running.run import Missing
 
 
@@ -365,7 +365,7 @@ def run(
     )
     from mortarbench.harness.environment.doctor import is_busy
     from mortarbench.harness.environment.environment import digest
-    from mortarbench.harness.running.executor import local_engine
+    from mortarbench.harness.running.executor import execute as execute_here
     from mortarbench.harness.running.run import run as run_suite
 
     environment = registries.environment()
@@ -375,13 +375,11 @@ def run(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
                 "be less precise"
             )
-        engine: EngineFactory
-        if dask is None:
-            engine = partial(local_engine, operators=registries.operators)
-        else:
+        execute: Execute = partial(execute_here, operators=registries.operators)
+        if dask is not None:
             from mortarbench.harness.running.cluster import on_cluster
 
-            engine = stack.enter_context(
+            execute = stack.enter_context(
                 on_cluster(
                     dask,
                     plugins=registries.files,
@@ -390,7 +388,7 @@ def run(
                     keep=lambda name, there: keep_environment(folder, name, there),
                     warn=display.warn,
                 )
-            )
+            ).execute
         missing = run_suite(
             asked,
             out=folder,
@@ -400,7 +398,7 @@ def run(
             digest=digest(environment),
             progress=display,
             fresh=fresh,
-            engine=engine,
+            execute=execute,
         )
         records = read_journal(folder, display.warn)
     return Results(

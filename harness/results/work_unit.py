@@ -8,11 +8,9 @@ steps once, in the order of the sequence.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from mortarbench.harness.files.store import Arrays
 from mortarbench.harness.record import Record
@@ -57,9 +55,6 @@ class Result:
     """Outcome of a measurement that was completed."""
 
     record: Record  #: record, complete except for the digests of `point` and `fields`
-    #: number of the part of the block; a block has several parts if its measurements
-    #: were interrupted, and only measurements in the same part ran consecutively
-    part: int = 0
     #: arrays of the point; None if the solver returned no point
     point: Arrays | None = None
     fields: Arrays | None = None  #: deformed state; None if it is not to be stored
@@ -86,30 +81,7 @@ class MeasurementFault:
 
 Outcome = Result | BuildFailure | MeasurementFault
 
-
-class Engine(Protocol):
-    """Function that executes blocks, on this machine or on the nodes of a cluster.
-
-    An engine may take several blocks from the iterator before it yields outcomes. An
-    engine may yield outcomes of several blocks in any order, and may yield the outcomes
-    of a lost block again. A block is created when the engine takes it, and the decision
-    on further repeats depends only on outcomes that were yielded before. An engine
-    should therefore take as few blocks as possible in advance.
-    """
-
-    def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
-        """Execute all `blocks`, and yield the outcomes of their measurements."""
-
-
-class EngineFactory(Protocol):
-    """Function that opens the engine of a run."""
-
-    def __call__(
-        self, commands: Commands, scratch: Path, cases: Path
-    ) -> AbstractContextManager[Engine]:
-        """Return a context manager that opens an engine, and closes it at the end.
-
-        commands : command lines of the processes that the engine starts
-        scratch : temporary folder that exists for the duration of the run
-        cases : folder of built cases, see `harness.processes.case_folder`
-        """
+#: Function that executes blocks with commands, in a scratch folder and with a folder of
+#: built cases (`harness.processes.case_folder`). It takes as few blocks as possible in
+#: advance, since blocks depend on the outcomes of earlier ones.
+Execute = Callable[[Iterator[WorkUnit], Commands, Path, Path], Generator[Outcome]]

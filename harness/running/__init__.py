@@ -1,1 +1,1 @@
-"""Runs of a suite: schedule, engines on one machine or a cluster, and progress."""
+"""Runs of a suite: schedule, executor on one machine or on a cluster, and progress."""

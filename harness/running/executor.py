@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from itertools import chain
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.work_unit import (
     BuildFailure,
     Commands,
-    Engine,
     MeasurementFault,
     Outcome,
     Result,
@@ -49,7 +47,6 @@ class Executor:
     cases: Path
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     _workers: dict[str, WorkerProcess] = field(default_factory=dict)
-    _number: int = -1  # number of the current block
     _entries: tuple[StoredCase, ...] = ()  # cases of that block, once they are built
     # reason why the sequence has fewer cases than requested steps; else empty
     _end_reason: str = ""
@@ -76,9 +73,7 @@ class Executor:
         """
         with report_full_disk(self.scratch):
             try:
-                # on a cluster, this method is called once for each turn of a block
-                if block.number != self._number:
-                    self._number, self._entries = block.number, ()
+                self._entries = ()
                 for turn in block.turns:
                     yield from self._turn(block, turn)
             except _BuildError as e:
@@ -305,17 +300,18 @@ class Executor:
         return self.scratch / "point.npz"
 
 
-@contextmanager
-def local_engine(
+def execute(
+    blocks: Iterator[WorkUnit],
     commands: Commands,
     scratch: Path,
     cases: Path,
     *,
     operators: Mapping[str, Maker] = NO_MAKERS,
-) -> Iterator[Engine]:
-    """Open the engine for one machine, which executes the blocks sequentially."""
+) -> Generator[Outcome]:
+    """Execute blocks one after the other on this machine, see `Executor`."""
     with closing(Executor(commands, scratch, cases, operators)) as executor:
-        yield lambda blocks: chain.from_iterable(map(executor.execute, blocks))
+        for block in blocks:
+            yield from executor.execute(block)
 
 
 def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:

@@ -1,11 +1,12 @@
 """Run of a suite: scheduling, resumption, and one journal line per measurement.
 
 This process selects the measurements, and it alone writes their results to the result
-folder. An engine for this machine or for a cluster executes the blocks of measurements.
+folder. An executor on this machine, or executors on a cluster, measure the blocks.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -33,12 +34,12 @@ from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.results.work_unit import (
     BuildFailure,
     Commands,
-    EngineFactory,
+    Execute,
     MeasurementFault,
     Outcome,
     Result,
 )
-from mortarbench.harness.running.executor import local_engine
+from mortarbench.harness.running.executor import execute as execute_here
 from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.suite import Suite
@@ -66,14 +67,14 @@ def run(
     digest: str,
     progress: Progress,
     fresh: bool = False,
-    engine: EngineFactory = local_engine,
+    execute: Execute = execute_here,
 ) -> Missing:
     """Complete the measurements of `suite` in the result folder `out`.
 
     resolve : returns a solver with its options set; all options are stored in records
     environment, digest : content of environment.json, and the digest of that content
     fresh : delete the previous results in `out` first
-    engine : opens the engine that executes the blocks
+    execute : executes the blocks, on this machine or on a cluster
 
     Returns
     -------
@@ -126,15 +127,18 @@ def run(
                 schedule=schedule,
                 progress=progress,
             )
-            with engine(commands, scratch, out.resolve() / "cases") as execute:
-                for outcome in execute(schedule.blocks()):
+            outcomes = execute(
+                schedule.blocks(), commands, scratch, out.resolve() / "cases"
+            )
+            with contextlib.closing(outcomes):
+                for outcome in outcomes:
                     recorder.take(outcome)
         return Missing(unbuilt=schedule.unbuilt, faults=recorder.remaining_faults())
 
 
 @dataclass(eq=False, kw_only=True)
 class _Recorder:
-    """Writer that stores each outcome of an engine once and reports progress."""
+    """Writer that stores each outcome once and reports progress."""
 
     out: Path
     journal: Journal
@@ -183,9 +187,6 @@ class _Recorder:
 
     def _take_result(self, result: Result) -> None:
         record = result.record
-        if result.part:
-            number = self.schedule.block_of_part(record.block, result.part)
-            record = record.replace(block=number)
         # Write the line last, because it must not refer to missing files.
         if result.point is not None:
             record = record.replace(vectors=save(self.out, result.point))

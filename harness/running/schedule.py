@@ -45,8 +45,6 @@ class Schedule:
         default_factory=set
     )  # run IDs of the measurements in the journal
     _next: int = 0  # number of the next new block
-    # new block number by the original block number and the number of the part
-    _parts: dict[tuple[int, int], int] = field(default_factory=dict)
 
     @property
     def cells(self) -> int:
@@ -87,16 +85,6 @@ class Schedule:
     def is_measured(self, run_id: str) -> bool:
         """Return True if the measurement is in the journal."""
         return run_id in self._done
-
-    def block_of_part(self, block: int, part: int) -> int:
-        """Return the new block number of a part measured later or on another machine.
-
-        Times are paired within blocks, so this part needs a separate block number.
-        """
-        if (block, part) not in self._parts:
-            self._parts[block, part] = self._next
-            self._next += 1
-        return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
         """Mark the cases of a block as unbuilt; return False if all already were."""
