@@ -123,16 +123,6 @@ def test_each_block_is_announced_before_it_starts():
     ]
 
 
-def test_each_part_of_a_block_has_its_own_number():
-    schedule = schedule_of()
-    first = next(schedule.blocks()).number
-    numbers = [schedule.block_of_part(*key) for key in ((0, 1), (0, 2), (1, 1))]
-
-    assert len({first, *numbers}) == 4
-    assert schedule.block_of_part(0, 2) == numbers[1]
-    assert next(schedule.blocks()).number not in numbers
-
-
 def test_the_paired_interval_has_its_nominal_coverage():
     rng = np.random.default_rng(314159)
     hits = 0
