@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -20,6 +19,7 @@ from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.files.store import read_point
 from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.processes.case_folder import content_digest
+from mortarbench.harness.processes.locks import file_lock
 from mortarbench.harness.processes.protocol import Source, source_of
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
@@ -39,7 +39,7 @@ REMEMBERED_NOTE = (
     f"takes more than {REMEMBERED_SPEEDUP:g} times as long, or returns the same point"
 )
 
-_SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
+_SCRATCH = "mortarbench-tmp-"
 
 
 class JudgedMeasurement(NamedTuple):
@@ -264,30 +264,20 @@ def measure_once(
 def scratch_folder() -> Iterator[Path]:
     """Create a folder for temporary files, removed at the end of the context.
 
-    Folders that killed processes left behind are removed first. Each process holds a
-    lock on its folder, which the kernel releases when the process ends. A folder whose
-    lock is free is therefore abandoned.
+    Each process holds a lock on its folder, which the kernel releases when the process
+    ends. Folders without a lock were left behind by killed processes, and are removed.
     """
     for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
-        with suppress(OSError):
-            if stale.lstat().st_uid == os.getuid() and not stale.is_symlink():
-                lock = os.open(stale / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-                try:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(stale)
-                finally:
-                    os.close(lock)
-    is_ours = False
-    # Before the new folder is locked, another process may treat it as abandoned and
-    # remove it. In this case, another folder is created.
-    while not is_ours:
-        with TemporaryDirectory(prefix=_SCRATCH) as name:
-            path = Path(name) / _LOCK
-            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                is_ours = path.exists()
-                if is_ours:
-                    yield Path(name)
-            finally:
-                os.close(lock)
+        # the folder is in use, or belongs to another user
+        with suppress(OSError), file_lock(stale, flags=os.O_DIRECTORY, waits=False):
+            shutil.rmtree(stale)
+    while True:
+        with TemporaryDirectory(prefix=_SCRATCH) as name, ExitStack() as stack:
+            folder = Path(name)
+            with suppress(FileNotFoundError):
+                stack.enter_context(file_lock(folder, flags=os.O_DIRECTORY))
+            # Before the new folder is locked, another process may treat it as abandoned
+            # and remove it. In this case, another folder is created.
+            if folder.exists():
+                yield folder
+                return
