@@ -46,7 +46,7 @@ from mortarbench.harness.processes.protocol import (
     source_of,
 )
 from mortarbench.harness.record import Verdict
-from mortarbench.harness.verify.measure import one_line
+from mortarbench.harness.errors import one_line
 
 POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
 START_SECONDS = 120.0  #: time limit for starting a worker, and for loading a QP
