@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from math import inf, isinf
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
 from typing import Any, NamedTuple
 
 from mortarbench.harness.errors import FaultError, InputError
@@ -19,8 +15,8 @@ from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.files.store import read_point
 from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.processes.case_folder import content_digest
-from mortarbench.harness.processes.locks import file_lock
 from mortarbench.harness.processes.protocol import Source, source_of
+from mortarbench.harness.processes.scratch import scratch_folder
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
@@ -38,8 +34,6 @@ REMEMBERED_NOTE = (
     "the solver reuses answers of earlier solves: for a QP with another objective it "
     f"takes more than {REMEMBERED_SPEEDUP:g} times as long, or returns the same point"
 )
-
-_SCRATCH = "mortarbench-tmp-"
 
 
 class JudgedMeasurement(NamedTuple):
@@ -176,21 +170,6 @@ def _check_memory(limit: float, record: Record) -> Record:
     return record
 
 
-@contextmanager
-def single_worker(command: list[str]) -> Iterator[WorkerProcess]:
-    """Start a worker for one measurement; the worker ends with the context.
-
-    command : starts the worker; two file descriptors are appended
-    """
-    with scratch_folder() as scratch:
-        worker = WorkerProcess(command, scratch / "worker.log")
-        try:
-            worker.start()
-            yield worker
-        finally:
-            worker.close()
-
-
 def measure_once(
     worker: WorkerProcess,
     case: Callable[[], Case],
@@ -249,26 +228,3 @@ def measure_once(
         bounds, objection = certified(case(), solution)
         record = noted(record, objection).replace(**bounds)
     return record, solution
-
-
-@contextmanager
-def scratch_folder() -> Iterator[Path]:
-    """Create a folder for temporary files, removed at the end of the context.
-
-    Each process holds a lock on its folder, which the kernel releases when the process
-    ends. Folders without a lock were left behind by killed processes, and are removed.
-    """
-    for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
-        # the folder is in use, or belongs to another user
-        with suppress(OSError), file_lock(stale, flags=os.O_DIRECTORY, waits=False):
-            shutil.rmtree(stale)
-    while True:
-        with TemporaryDirectory(prefix=_SCRATCH) as name, ExitStack() as stack:
-            folder = Path(name)
-            with suppress(FileNotFoundError):
-                stack.enter_context(file_lock(folder, flags=os.O_DIRECTORY))
-            # Before the new folder is locked, another process may treat it as abandoned
-            # and remove it. In this case, another folder is created.
-            if folder.exists():
-                yield folder
-                return

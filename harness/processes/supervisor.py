@@ -36,6 +36,7 @@ import psutil
 
 from mortarbench.harness import limits
 from mortarbench.harness.environment.cpus import fastest_first
+from mortarbench.harness.errors import one_line
 from mortarbench.harness.processes import parent
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.protocol import (
@@ -46,7 +47,6 @@ from mortarbench.harness.processes.protocol import (
     source_of,
 )
 from mortarbench.harness.record import Verdict
-from mortarbench.harness.errors import one_line
 
 POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
 START_SECONDS = 120.0  #: time limit for starting a worker, and for loading a QP
@@ -185,7 +185,7 @@ class WorkerProcess:
                     return self._reply_to_end(end, memory_limit)
             except OSError as e:  # a process, pipe or log could not be created
                 self._kill()
-                return Reply(fault=True, message=one_line(e))
+                return Reply(fault=True, message=one_line(str(e)))
         self._keeps_ranks = "step" in request and source_of(request).is_shared
         reply = self._reply(answer=answer, elapsed_seconds=elapsed)
         if not self._keeps_ranks and self._has_children():
@@ -202,10 +202,11 @@ class WorkerProcess:
     def close(self) -> None:
         """Close the pipe of requests; kill the worker if it does not exit in time.
 
-        The time limit is `CLOSE_SECONDS`.
+        The time limit is `CLOSE_SECONDS`. A worker that has not answered a request is
+        killed at once.
         """
         try:
-            if self._process is not None:
+            if self._process is not None and self._is_warm:
                 os.close(self._requests)
                 self._requests = -1
                 with suppress(subprocess.TimeoutExpired):

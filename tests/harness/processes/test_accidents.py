@@ -21,9 +21,9 @@ from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import supervisor
 from mortarbench.harness.processes.measurement import (
     measure_and_judge,
-    scratch_folder,
 )
 from mortarbench.harness.processes.protocol import ForeignReplyError, event_of
+from mortarbench.harness.processes.scratch import scratch_folder
 from mortarbench.harness.processes.supervisor import (
     REPLACEMENT_NOTE,
     WorkerProcess,
