@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import ExitStack, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from sys import stderr
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,10 +19,18 @@ from mortarbench.harness import Record, Solver, Verdict, checked
 from mortarbench.harness.distributed.mpi import ranks_asked, too_few_parts
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.names import assemble
+from mortarbench.harness.processes.scratch import scratch_folder, single_worker
+from mortarbench.harness.processes.solver_file import write_solver
 from mortarbench.harness.processes.termination import ended_by_signals
 from mortarbench.harness.record import finite
 from mortarbench.harness.registry import SolverSpec, check_solver, options_of, resolve
-from mortarbench.registries import TURN, Plugins, one_thread
+from mortarbench.registries import (
+    TURN,
+    Plugins,
+    defer_parts_of_numpy,
+    one_thread,
+    with_history,
+)
 from mortarbench.text import outcome
 
 if TYPE_CHECKING:
@@ -316,53 +324,44 @@ def solve(
         name = type(solver).__name__
         solvers = {name: solver}
     spec = SolverSpec(name=name, label=name, options=requested).on(ranks)
-    configured = resolve(spec, solvers)
-    defaults = options_of(resolve(SolverSpec(name=name, label=name), solvers))
-    if options_of(configured).get("history") is False and "history" not in requested:
-        # Recording the history slows down the solver, but times of single solves are
-        # not used in comparisons.
-        defaults = {**defaults, "history": True}
-        spec = replace(spec, options={**requested, "history": True})
-        configured = resolve(spec, solvers)
-
-    from mortarbench.harness.environment.environment import digest
-    from mortarbench.harness.processes.measurement import (
-        measure_once,
-        scratch_folder,
-        single_worker,
-    )
-    from mortarbench.harness.processes.protocol import Source
-    from mortarbench.harness.processes.solver_file import write_solver
-    from mortarbench.harness.verify.verdicts import new_record
-    from mortarbench.verification import remarks
-
-    record = new_record(
-        problem.id,
-        spec,
-        options=options_of(configured),
-        tol=tol,
-        repeat=0,
-        environment=digest(registries.environment()),
-    )
+    parts = ranks
+    if ranks > 1:
+        parts = problem.id.family.subdomains(problem.form, problem.params)
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
-    source = Source.FILE
-    if ranks > 1:
-        ours = registries.hold_only_builtins()
-        source = Source.RANKS if ours else Source.SHARES
-        parts = problem.id.family.subdomains(problem.form, problem.params)
-    if ranks > 1 and parts < ranks:
-        message = too_few_parts(parts, ranks)
-        record = record.replace(status=Verdict.DECLINED, message=message)
-    else:
-        with ExitStack() as stack:
+    with ExitStack() as stack:
+        if parts >= ranks:
             scratch = stack.enter_context(scratch_folder())
             copy = None if isinstance(solver, str) else scratch / "solver.pickle"
             if copy is not None:
-                write_solver(copy, configured)
-            command = registries.worker_command(spec, copy)
-            # The worker imports its libraries while this process builds the case.
+                write_solver(copy, resolve(with_history(spec, solvers), solvers))
+            command = registries.worker_command(spec, copy, records=True)
+            # The worker imports its libraries while this process imports its own.
             worker = stack.enter_context(single_worker(command))
+        defer_parts_of_numpy()
+
+        from mortarbench.harness.environment.environment import digest
+        from mortarbench.harness.processes.measurement import measure_once
+        from mortarbench.harness.processes.protocol import Source
+        from mortarbench.harness.verify.verdicts import new_record
+        from mortarbench.verification import remarks
+
+        spec = with_history(spec, solvers)
+        default = with_history(SolverSpec(name=name, label=name), solvers)
+        record = new_record(
+            problem.id,
+            spec,
+            options=options_of(resolve(spec, solvers)),
+            tol=tol,
+            repeat=0,
+            environment=digest(registries.environment()),
+        )
+        if parts < ranks:
+            message = too_few_parts(parts, ranks)
+            record = record.replace(status=Verdict.DECLINED, message=message)
+        else:
+            ours = registries.hold_only_builtins()
+            by_ranks = Source.RANKS if ours else Source.SHARES
             # Code of a family may print, and standard output is reserved for the answer
             stack.enter_context(one_thread())
             stack.enter_context(redirect_stdout(stderr))
@@ -371,19 +370,19 @@ def solve(
                 lambda: problem.family_case,
                 record,
                 registries.reference,
-                source=source,
+                source=by_ranks if ranks > 1 else Source.FILE,
                 time_limit=time_limit,
             )
-        # remarks on the input are known only if this process has built the case
-        notes = problem.remarks if "family_case" in vars(problem) else ()
-        notes = (*notes, *remarks(problem, record, solution))
+            # remarks on the input are known only if this process has built the case
+            notes = problem.remarks if "family_case" in vars(problem) else ()
+            notes = (*notes, *remarks(problem, record, solution))
     return Answer(
         case=problem,
         record=record,
         solution=solution,
         spec=spec,
         solver=solver,
-        defaults=defaults,
+        defaults=options_of(resolve(default, solvers)),
         remarks=notes,
     )
 

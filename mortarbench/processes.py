@@ -16,7 +16,7 @@ from mortarbench.harness.processes.ranks import launch
 from mortarbench.harness.processes.solver_file import read_solver
 from mortarbench.harness.processes.worker import Worker, serve
 from mortarbench.harness.registry import SolverSpec, resolve, stand_for_harness
-from mortarbench.registries import Registries
+from mortarbench.registries import Registries, with_history
 
 
 def worker(registries: Registries, arguments: Sequence[str]) -> int:
@@ -35,6 +35,8 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         if "copy" in request:
             solvers = {name: read_solver(Path(request["copy"]))}
         spec = SolverSpec(name=name, label=name, options=request["options"])
+        if request["records"]:
+            spec = with_history(spec, solvers)
         solver = resolve(spec, solvers)
 
     def build(case: Mapping[str, Any], comm: Comm) -> CaseOnRanks:

@@ -24,6 +24,8 @@ from mortarbench.harness.registry import (
     entry_point_plugins,
     load_plugin,
     merged,
+    options_of,
+    resolve,
 )
 from mortarbench.problems import OPERATORS, PROBLEMS
 from mortarbench.solvers import SOLVERS
@@ -233,13 +235,16 @@ class Registries:
             and not self.files
         )
 
-    def worker_command(self, spec: SolverSpec, copy: Path | None = None) -> list[str]:
+    def worker_command(
+        self, spec: SolverSpec, copy: Path | None = None, *, records: bool = False
+    ) -> list[str]:
         """Return the command that starts the worker of a solver.
 
         The caller appends the file descriptors of the worker's two pipes.
 
         copy : file that contains the configured solver if it was passed as an object,
             see `harness.processes.solver_file`; else None
+        records : True if the solver records its iterations, see `with_history`
 
         Raises
         ------
@@ -251,6 +256,7 @@ class Registries:
             "name": spec.name,
             "options": spec.options if copy is None else {},
             "plugins": self._absolute_files(),
+            "records": records,
         }
         if copy is not None:
             request["copy"] = str(copy)
@@ -316,6 +322,18 @@ class Registries:
         if len(path.parts) > 1 or path.suffix:
             raise InputError(f"{text}: no such file; expected a suite in TOML")
         raise unknown("suite", str(text), suites)
+
+
+def with_history(spec: SolverSpec, solvers: Mapping[str, Solver]) -> SolverSpec:
+    """Return a spec that records the iterations, unless its options decide otherwise.
+
+    Recording slows down a solver, but times of single solves are not used in
+    comparisons.
+    """
+    has_option = options_of(resolve(spec, solvers)).get("history") is False
+    if not has_option or "history" in spec.options:
+        return spec
+    return replace(spec, options={**spec.options, "history": True})
 
 
 def installed(registries: Registries) -> Registries:

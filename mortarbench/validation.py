@@ -267,7 +267,7 @@ def test_solver(
     if isinstance(solver, str):
         resolve(spec, registries.solvers)
     from mortarbench.harness.conformance.conformance import CHECKS
-    from mortarbench.harness.processes.measurement import scratch_folder
+    from mortarbench.harness.processes.scratch import scratch_folder
     from mortarbench.harness.processes.solver_file import write_solver
     from mortarbench.harness.processes.supervisor import WorkerProcess
 

@@ -10,11 +10,9 @@ store a different QP under the name of a case (docs/security.md).
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,10 @@ from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import move_file, replace_file
 from mortarbench.harness.files.reading import read_text
+from mortarbench.harness.processes.locks import file_lock
+
+#: errors of reading an index of unexpected content
+_DAMAGE = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +52,7 @@ def find_or_build(
     """
     folder.mkdir(exist_ok=True)  # fails if the result folder was moved
     key = hex_digest([json.dumps(identity, sort_keys=True).encode()], 16)
-    with _locked(folder / f"{key}.lock"):
+    with file_lock(folder / f"{key}.lock", flags=os.O_RDWR | os.O_CREAT):
         stored = _look_up(folder, key)
         if stored is not None:
             return stored
@@ -89,29 +91,10 @@ def _look_up(folder: Path, key: str) -> StoredCase | None:
         if content_digest(path) != index["digest"]:
             return None
         return StoredCase(qp=path, digest=index["digest"], meta=index["meta"])
-    except (
-        InputError,
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ):
+    except (InputError, OSError, *_DAMAGE):
         return None
 
 
 def _check(index: Mapping[str, Any]) -> str:
     """Return the digest of an index, whose meta data the QP's digest does not cover."""
     return hex_digest([json.dumps(index, sort_keys=True).encode()], 16)
-
-
-@contextmanager
-def _locked(lock: Path) -> Iterator[None]:
-    """Hold an exclusive file lock, which the kernel releases if this process ends."""
-    fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(fd)  # also releases the lock

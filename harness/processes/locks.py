@@ -1,9 +1,12 @@
-"""Locks for the threads of a process that may fork."""
+"""Locks for processes, and for the threads of a process that may fork."""
 
 from __future__ import annotations
 
+import fcntl
 import os
-from contextlib import ContextDecorator
+from collections.abc import Iterator
+from contextlib import ContextDecorator, contextmanager
+from pathlib import Path
 from threading import RLock
 
 
@@ -30,3 +33,24 @@ class ForkSafeLock(ContextDecorator):
             self._lock.release()
         else:
             self._lock = RLock()
+
+
+@contextmanager
+def file_lock(path: Path, *, flags: int = 0, waits: bool = True) -> Iterator[None]:
+    """Hold an exclusive lock on a file or folder, which a process loses when it ends.
+
+    flags : further flags of open(2)
+    waits : False to raise BlockingIOError if another process holds the lock
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened, for instance because it is a symbolic link.
+
+    """
+    fd = os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
+        yield
+    finally:
+        os.close(fd)  # also releases the lock

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
-import shutil
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from math import inf, isinf
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
 from typing import Any, NamedTuple
 
 from mortarbench.harness.errors import FaultError, InputError
@@ -21,6 +16,7 @@ from mortarbench.harness.files.store import read_point
 from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.protocol import Source, source_of
+from mortarbench.harness.processes.scratch import scratch_folder
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
@@ -38,8 +34,6 @@ REMEMBERED_NOTE = (
     "the solver reuses answers of earlier solves: for a QP with another objective it "
     f"takes more than {REMEMBERED_SPEEDUP:g} times as long, or returns the same point"
 )
-
-_SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
 
 
 class JudgedMeasurement(NamedTuple):
@@ -82,7 +76,7 @@ def measure_and_judge(
     if not isinf(memory_limit):
         request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
-    out = Path(request["out"])
+    out, by_ranks = Path(request["out"]), source_of(request) is Source.RANKS
     try:
         out.unlink(missing_ok=True)
         ask = partial(worker.ask, time_limit=time_limit, memory_limit=memory_limit)
@@ -99,51 +93,36 @@ def measure_and_judge(
             threads=reply.threads,
             cpu=reply.cpu,
         )
-        if source_of(request) is not Source.RANKS:
+        if not by_ranks:
             qp = whole()
             record = record.replace(sizes=qp.sizes)
         elif reply.built is not None:
             record = record.replace(**reply.built)
         if reply.answer is None:
             return JudgedMeasurement(record.replace(status=reply.verdict), None)
+        answer = {k: reply.answer[k] for k in ("iterations", "counts", "message")}
+        reported = reply.answer["reported"].items()
         solution = replace(
             read_point(out, Status(reply.answer["claimed"])),
-            iterations=reply.answer["iterations"],
-            counts=reply.answer["counts"],
-            reported={
-                k: v for k, v in reply.answer["reported"].items() if v is not None
-            },
-            message=reply.answer["message"],
+            **answer,
+            reported={k: v for k, v in reported if v is not None},
         )
     except InputError as e:
         raise FaultError(f"{record.solver} on {record.case}: {e}") from None
     except OSError as e:
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
-    record, *more = _with_cost(reply, record)
-    notes += more
-    by_ranks = source_of(request) is Source.RANKS
+    cost, more = _cost(reply, record.ranks)
+    record = record.replace(**cost)
     if by_ranks:
         fields = dict(reply.answer["fields"])
         fields["status"] = Verdict(fields["status"])
         record = claimed(record, solution).replace(**fields)
-        notes += reply.answer["notes"]
+        more += reply.answer["notes"]
     else:
         record = judged(record, qp, solution)
-    record = _check_memory(memory_limit, noted(record, reply.message, *notes))
+    record = _check_memory(memory_limit, noted(record, reply.message, *notes, *more))
     return JudgedMeasurement(record, solution, needs_evaluation=not by_ranks)
-
-
-def _with_cost(reply: Reply, record: Record) -> tuple[Record, *tuple[str, ...]]:
-    """Add the cost of a measurement to its record; return the record with any notes."""
-    assert reply.answer is not None
-    cost, *notes = _plausible_cost(reply)
-    notes += [REMEMBERED_NOTE] * bool(cost.get("remembered"))
-    if record.ranks > 1:
-        # rank 0 measures only its own memory, the parent measures the memory of all
-        # ranks
-        cost["peak_mib"] = reply.peak_mib
-    return record.replace(**cost), *notes
 
 
 def case_request(record: Record) -> dict[str, Any]:
@@ -152,20 +131,26 @@ def case_request(record: Record) -> dict[str, Any]:
     return {"case": case}
 
 
-def _plausible_cost(reply: Reply) -> tuple[dict[str, Any], *tuple[str, ...]]:
-    """Return the worker's times, or the parent's time and a note if they are longer."""
-    answer, elapsed = reply.answer, reply.elapsed_seconds
-    assert answer is not None
-    cost = dict(answer["cost"])
-    worked = answer["worked_seconds"]
-    if elapsed is None or "total_seconds" not in cost or 0 <= worked <= elapsed:
-        return (cost,)
-    mean = elapsed / answer["solves"]
-    cost |= {"prepare_seconds": None, "solve_seconds": None, "total_seconds": mean}
-    return cost, (
-        f"the worker reported {worked:.3g} s of work, but was done after {elapsed:.3g} "
-        "s by the parent's clock; the parent's time is recorded"
-    )
+def _cost(reply: Reply, ranks: int) -> tuple[dict[str, Any], list[str]]:
+    """Return the cost of a measurement as fields of its record, and notes.
+
+    Times that exceed the time on the parent's clock are replaced by the latter.
+    """
+    assert reply.answer is not None
+    cost, worked = dict(reply.answer["cost"]), reply.answer["worked_seconds"]
+    elapsed, notes = reply.elapsed_seconds, list[str]()
+    if elapsed is not None and cost and not 0 <= worked <= elapsed:
+        mean = elapsed / reply.answer["solves"]
+        cost |= {"prepare_seconds": None, "solve_seconds": None, "total_seconds": mean}
+        notes.append(
+            f"the worker reported {worked:.3g} s of work, but was done after "
+            f"{elapsed:.3g} s by the parent's clock; the parent's time is recorded"
+        )
+    if cost.get("remembered"):
+        notes.append(REMEMBERED_NOTE)
+    if ranks > 1:  # rank 0 measures only its own memory, the parent that of all ranks
+        cost["peak_mib"] = reply.peak_mib
+    return cost, notes
 
 
 def _check_memory(limit: float, record: Record) -> Record:
@@ -183,21 +168,6 @@ def _check_memory(limit: float, record: Record) -> Record:
     if not succeeded and out_of_memory(record.message, peak, limit):
         return record.replace(status=Verdict.MEMORY_LIMIT)
     return record
-
-
-@contextmanager
-def single_worker(command: list[str]) -> Iterator[WorkerProcess]:
-    """Start a worker for one measurement; the worker ends with the context.
-
-    command : starts the worker; two file descriptors are appended
-    """
-    with scratch_folder() as scratch:
-        worker = WorkerProcess(command, scratch / "worker.log")
-        try:
-            worker.start()
-            yield worker
-        finally:
-            worker.close()
 
 
 def measure_once(
@@ -258,36 +228,3 @@ def measure_once(
         bounds, objection = certified(case(), solution)
         record = noted(record, objection).replace(**bounds)
     return record, solution
-
-
-@contextmanager
-def scratch_folder() -> Iterator[Path]:
-    """Create a folder for temporary files, removed at the end of the context.
-
-    Folders that killed processes left behind are removed first. Each process holds a
-    lock on its folder, which the kernel releases when the process ends. A folder whose
-    lock is free is therefore abandoned.
-    """
-    for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
-        with suppress(OSError):
-            if stale.lstat().st_uid == os.getuid() and not stale.is_symlink():
-                lock = os.open(stale / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-                try:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(stale)
-                finally:
-                    os.close(lock)
-    is_ours = False
-    # Before the new folder is locked, another process may treat it as abandoned and
-    # remove it. In this case, another folder is created.
-    while not is_ours:
-        with TemporaryDirectory(prefix=_SCRATCH) as name:
-            path = Path(name) / _LOCK
-            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                is_ours = path.exists()
-                if is_ours:
-                    yield Path(name)
-            finally:
-                os.close(lock)

@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from select import EPOLLIN, epoll
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -167,37 +167,39 @@ def _describe_exit(status: int) -> str:
     )
 
 
-class Build(Protocol):
-    """Function that builds the case of a request; all ranks call it together."""
-
-    def __call__(self, case: Mapping[str, Any], comm: Comm, /) -> CaseOnRanks:
-        """Build a case, given as a mapping with family, params and form."""
+#: builds the case of a request, a mapping with family, params and form; all ranks call
+#: the function together
+Build: TypeAlias = "Callable[[Mapping[str, Any], Comm], CaseOnRanks]"
 
 
-class Host:
-    """State of one rank; rank 0 calls its methods on all ranks.
+class Ranks:
+    """State of one rank; rank 0 calls methods of this class on all ranks.
 
     Attributes
     ----------
     served : objects of the case that the ranks have built
-    case : the case; None on all ranks but rank 0
+    case : the case; None on all ranks but rank 0, and after a failure
     failure : reason why the last build failed, else None
+    call : calls a method on all ranks, from rank 0
 
     """
 
-    def __init__(
-        self, comm: Comm, build: Build, limit: Callable[[float | None], None]
-    ) -> None:
-        """Join the other ranks.
+    def __init__(self, build: Build, limit: Callable[[float | None], None]) -> None:
+        """Join the other ranks, on a separate CPU if there are enough CPUs.
 
         limit : sets the memory limit of this process, in MiB; None removes the limit
         """
-        self.comm, self._build, self.limit = comm, build, limit
+        self.comm, self._build, self.limit = world(), build, limit
         self.served: Any = None
         self.case: Case | None = None
         self.failure: Exception | None = None
+        self.call = Lead(self.comm, self)
+        cpus = fastest_first(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cpus[self.comm.rank % len(cpus)]})
+        if RECORD in os.environ:
+            os.set_inheritable(int(os.environ[RECORD]), False)
 
-    def build(self, case: Mapping[str, Any]) -> None:
+    def build_part(self, case: Mapping[str, Any]) -> None:
         """Build a case together with the other ranks."""
         if self.served is not None:
             self.served.lead.served = None  # refuses further calls
@@ -206,92 +208,59 @@ class Host:
             built = self.comm.together(lambda: self._build(case, self.comm))
         except (InputError, RankFailedError) as e:  # all ranks raise the same error
             self.failure = e
-            return
         except Exception as e:
             self.failure = RankFailedError(in_a_line(e))
-            return
-        self.served = built.served
-        if not self.comm.rank:
-            self._case = built.case
-
-    def finish(self) -> None:
-        """Complete the case on rank 0, which calls methods of all ranks."""
-        self.served.lead = Lead(self.comm, self.served, "served.")
-        self.case = self._case()
+        else:
+            self.served, self._case = built.served, built.case
 
     def peaks(self) -> list[float]:
         """Return the peak memory of each rank, in MiB."""
         return self.comm.gather(memory_mib("VmHWM") or 0.0)
 
-
-class RanksAsOne:
-    """All ranks as seen by the worker on rank 0."""
-
-    def __init__(self, host: Host) -> None:
-        self.host, self._lead = host, Lead(host.comm, host)
-
     def build(self, case: Mapping[str, Any]) -> dict[str, Any]:
-        """Build a case; return the entries of the event "built".
+        """Build a case on all ranks; return the entries of the event "built".
 
         The entries are the `sizes` and the digest `qp` of the QP, and the time of the
         slowest rank, in s. They are empty after a failure.
         """
-        start, host = time.perf_counter(), self.host
-        self._lead("build", dict(case))
-        if host.failure is not None:
+        start = time.perf_counter()
+        self.call("build_part", dict(case))
+        if self.failure is not None:
             return {}
+        self.served.lead = Lead(self.comm, self.served, "served.")
         try:
-            host.finish()
+            self.case = self._case()
         except InputError as e:
-            host.failure = e
+            self.failure = e
             return {}
-        assert host.case is not None
-        return {
-            "sizes": host.case.qp.sizes,
-            "qp": host.case.digest,
-            "build_seconds": time.perf_counter() - start,
-        }
+        seconds = time.perf_counter() - start
+        sizes, digest = self.case.qp.sizes, self.case.digest
+        return {"sizes": sizes, "qp": digest, "build_seconds": seconds}
 
-    def solver(self, solver: Solver) -> Solver:
-        """Return the solver, or one that reports why the ranks have no QP."""
-        if self.host.failure is None:
-            return solver
-        return _Unbuilt(self.host.failure)
-
-    @property
-    def qp(self) -> QP:
-        """The QP that the ranks have built, or that of one variable after a failure."""
-        if self.host.case is None:
-            return QP.from_arrays(np.eye(1), np.zeros(1))
-        return self.host.case.qp
+    def problem(self, solver: Solver) -> tuple[Solver, QP]:
+        """Return the solver and the QP; after a failure, a solver that reports it."""
+        if self.case is not None:
+            return solver, self.case.qp
+        assert self.failure is not None
+        return _Unbuilt(self.failure), QP.from_arrays(np.eye(1), np.zeros(1))
 
     def reported(self) -> dict[str, float]:
         """Return the number and the peak memory of the ranks, for a solution."""
-        peaks = self._lead("peaks")
-        mean = sum(peaks) / len(peaks)
+        peaks = self.call("peaks")
         return {
             "ranks": len(peaks),
             "rank_peak_mib_largest": max(peaks),
-            "rank_peak_mib_mean": mean,
+            "rank_peak_mib_mean": sum(peaks) / len(peaks),
         }
-
-    def limit(self, mib: float | None) -> None:
-        """Set the memory limit of each rank, in MiB; None removes the limit."""
-        self._lead("limit", mib)
 
     def judge(self, s: Solution, tol: float) -> tuple[dict[str, Any], list[str]]:
         """Judge an answer with new factors; return fields of a record, and notes."""
-        case = self.host.case
         # after a failure of ranks, products would fail again
-        if case is None or (s.status is Status.FAILED and not has_point(s)):
+        if self.case is None or (s.status is Status.FAILED and not has_point(s)):
             return {"status": Verdict(s.status)}, []
         # factors that code of a solver may have reached are not used
-        self._lead("served.forget")
-        return evaluated(case, s, tol)
-
-    def end(self) -> None:
-        """End the service of the other ranks."""
-        self.host.comm.order(None)
+        self.call("served.forget")
+        return evaluated(self.case, s, tol)
 
 
 @dataclass(frozen=True)
@@ -305,12 +274,3 @@ class _Unbuilt:
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         raise self.failure
-
-
-def this_rank(build: Build, limit: Callable[[float | None], None]) -> Host:
-    """Join the other ranks; bind this rank to its own CPU if there are enough CPUs."""
-    comm, cpus = world(), fastest_first(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cpus[comm.rank % len(cpus)]})
-    if RECORD in os.environ:
-        os.set_inheritable(int(os.environ[RECORD]), False)
-    return Host(comm, build, limit)

@@ -22,9 +22,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from select import select
@@ -35,6 +36,7 @@ import psutil
 
 from mortarbench.harness import limits
 from mortarbench.harness.environment.cpus import fastest_first
+from mortarbench.harness.errors import one_line
 from mortarbench.harness.processes import parent
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.protocol import (
@@ -45,7 +47,6 @@ from mortarbench.harness.processes.protocol import (
     source_of,
 )
 from mortarbench.harness.record import Verdict
-from mortarbench.harness.verify.measure import one_line
 
 POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
 START_SECONDS = 120.0  #: time limit for starting a worker, and for loading a QP
@@ -62,9 +63,6 @@ SETTLE_SECONDS = 0.5
 #: CPU time of a worker between an answer and the next request, relative to wall time,
 #: above which the worker counts as busy
 MAX_IDLE_CPU_SHARE = 0.5
-#: largest CPU time, in s, between an answer and the next request that does not count as
-#: busy; the kernel reports multiples of 0.01 s
-MIN_BUSY_CPU_SECONDS = 0.02
 LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
 #: length to which the last line of the log is shortened in a message
 MAX_LAST_LINE_CHARACTERS = 300
@@ -126,7 +124,7 @@ class WorkerProcess:
         self._command = command
         self._log = log
         self._process: subprocess.Popen[bytes] | None = None  # the worker's parent
-        self._worker = 0  # process ID of the worker, once it is ready
+        self._worker: Any = None  # the worker as psutil.Process, once it is ready
         # file descriptors of the two pipes in this process
         self._requests = self._replies = -1
         self._unread = b""
@@ -136,7 +134,7 @@ class WorkerProcess:
         self._keeps_ranks = False
         self._was_busy = False  # True if the worker used CPU time while it was idle
         # time on the parent's clock and CPU time of the worker at the last answer
-        self._idle_since: tuple[float, float] | None = None
+        self._idle_since = (0.0, 0.0)
         # number of threads and CPU that the worker reports after its warm-up
         self._facts: dict[str, Any] = {}
         self._peak_mib = 0.0
@@ -173,7 +171,7 @@ class WorkerProcess:
         """
         self._peak_mib, self._built = 0.0, None
         for worker in tuple(self._all):
-            worker._end_if_busy()
+            worker._end_if_busy(worker._has_been_busy)
         was_busy, self._was_busy = self._was_busy, False
         while True:
             was_warm = self._is_warm
@@ -187,26 +185,28 @@ class WorkerProcess:
                     return self._reply_to_end(end, memory_limit)
             except OSError as e:  # a process, pipe or log could not be created
                 self._kill()
-                return Reply(fault=True, message=one_line(e))
+                return Reply(fault=True, message=one_line(str(e)))
         self._keeps_ranks = "step" in request and source_of(request).is_shared
+        reply = self._reply(answer=answer, elapsed_seconds=elapsed)
         if not self._keeps_ranks and self._has_children():
             self._kill()  # remaining processes would disturb the next measurement
-        elif self._stays_busy():
-            self._kill()
-            was_busy = True
-        else:
+        self._end_if_busy(self._stays_busy)
+        if self._is_warm:
             self._idle_since = (time.monotonic(), self._cpu_seconds())
-        note = REPLACEMENT_NOTE if was_busy else ""
-        return self._reply(answer=answer, elapsed_seconds=elapsed, message=note)
+        if was_busy or self._was_busy:
+            self._was_busy = False
+            return replace(reply, message=REPLACEMENT_NOTE)
+        return reply
 
     @_LOCK
     def close(self) -> None:
         """Close the pipe of requests; kill the worker if it does not exit in time.
 
-        The time limit is `CLOSE_SECONDS`.
+        The time limit is `CLOSE_SECONDS`. A worker that has not answered a request is
+        killed at once.
         """
         try:
-            if self._process is not None:
+            if self._process is not None and self._is_warm:
                 os.close(self._requests)
                 self._requests = -1
                 with suppress(subprocess.TimeoutExpired):
@@ -230,10 +230,10 @@ class WorkerProcess:
         oom_kills, sent, elapsed = _oom_kills(), time.monotonic(), None
         self._send(request)
         is_shared, is_timed = source_of(request).is_shared, measures(request)
-        final_limit, stage = time_limit, ""
+        final_limit = time_limit
         try:
             if is_shared:
-                self._built = self._await("built", time_limit, memory_limit, "build: ")
+                self._built = self._await("built", time_limit, memory_limit)
             self._await("start", START_SECONDS, memory_limit)
             if is_timed:
                 self._await("solved", time_limit, memory_limit)
@@ -242,18 +242,26 @@ class WorkerProcess:
                 final_limit = max(time_limit, POINT_SECONDS)
             if is_shared:
                 self._await("measured", POINT_SECONDS, memory_limit)
-                stage = "evaluation of the answer: "
-            memory = None if is_shared else memory_limit
-            answer = self._await("done", final_limit, memory, stage)
+            # the memory of the evaluation does not count
+            answer = self._await(
+                "done", final_limit, None if is_shared else memory_limit
+            )
         except _WorkerEndError as end:
             end.is_oom = end.signal == "SIGKILL" and _oom_kills() > oom_kills
+            if is_shared:
+                stages = {"built": "build: ", "done": "evaluation of the answer: "}
+                end.stage = stages.get(end.event, "")
             raise
         self._trim_log()
         return answer, elapsed
 
     def _reply_to_end(self, end: _WorkerEndError, memory_limit: float) -> Reply:
         """Diagnose the end of a worker: a verdict on the solver, or a fault."""
-        peak, message, verdict = self._peak_mib, str(end), end.verdict
+        peak, verdict = self._peak_mib, end.verdict
+        message = f"{end.stage}{'before solving: ' * end.is_early}{end.message}"
+        if end.is_early and verdict is Verdict.TIME_LIMIT:
+            # the limit `START_SECONDS` has expired, not the limit of the suite
+            verdict = Verdict.FAILED
         from_outside = end.signal in _EXTERNAL_SIGNALS
         has_failed = from_outside or _MACHINE_FAILURE.search(message) is not None
         is_fault = end.is_fault or (end.is_early and has_failed)
@@ -288,7 +296,9 @@ class WorkerProcess:
             if self._process is None:
                 self._spawn(memory_limit)
             self._await("ready", START_SECONDS, memory_limit)
-            self._worker = next(iter(self._tree()), 0)
+            # if the worker has ended, the next event is not received
+            with suppress(psutil.Error, IndexError):
+                self._worker = psutil.Process(self._tree()[0])
             try:
                 if self._warms_up:
                     self._send({"warm_up": True})
@@ -304,9 +314,12 @@ class WorkerProcess:
 
     def _spawn(self, memory_limit: float) -> None:
         """Start the command below a small parent."""
-        limit = {limits.VARIABLE: str(memory_limit)}
         requests, self._requests = _pipe()
         self._replies, replies = _pipe()
+        cpu = fastest_first(os.sched_getaffinity(0))[0]
+        above = (sys.executable, "-I", "-S", parent.__file__)
+        arguments = (os.getpid(), cpu, requests, replies)
+        limit = {limits.VARIABLE: str(memory_limit)}
         try:
             self._log.write_bytes(b"")
             # In append mode, the worker writes at the new end of the file after
@@ -314,14 +327,7 @@ class WorkerProcess:
             # length of the file.
             with self._log.open("ab") as log:
                 self._process = subprocess.Popen(
-                    [
-                        *(sys.executable, "-I", "-S", parent.__file__),
-                        str(os.getpid()),
-                        str(fastest_first(os.sched_getaffinity(0))[0]),
-                        str(requests),
-                        str(replies),
-                        *self._command,
-                    ],
+                    [*above, *map(str, arguments), *self._command],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
@@ -338,13 +344,12 @@ class WorkerProcess:
             os.write(self._requests, (json.dumps(request) + "\n").encode())
 
     def _await(
-        self, event: str, limit: float, memory_limit: float | None, stage: str = ""
+        self, event: str, limit: float, memory_limit: float | None
     ) -> dict[str, Any]:
         """Wait for an event, and return its entries.
 
         limit : time limit, in s
         memory_limit : memory limit, in MiB; None if the memory is not recorded
-        stage : stage of the measurement, as a prefix of the error message
 
         Raises
         ------
@@ -352,10 +357,7 @@ class WorkerProcess:
             If the worker ends, exceeds a limit, or sends a different reply.
 
         """
-
-        def ended(verdict: Verdict, how: str, name: str = "") -> _WorkerEndError:
-            return _WorkerEndError(event, verdict, how, name, stage)
-
+        ended = partial(_WorkerEndError, event)
         deadline = time.monotonic() + limit
         while b"\n" not in self._unread:
             # Check before reading: the reply of a worker that dies afterwards still
@@ -383,9 +385,7 @@ class WorkerProcess:
         except ForeignReplyError as e:
             raise ended(Verdict.FAILED, str(e)) from None
         if reply.pop("event") == "fault":
-            end = ended(Verdict.FAILED, reply["what"])
-            end.is_fault = True
-            raise end
+            raise ended(Verdict.FAILED, reply["what"], is_fault=True)
         return reply
 
     def _excess(self, limit: float) -> str:
@@ -425,33 +425,33 @@ class WorkerProcess:
 
     def _has_children(self) -> bool:
         """Return True if the worker has started processes that still exist."""
-        for number in {*self._tree()} - {self._worker}:
+        for number in {*self._tree()} - {self._worker.pid}:
             with suppress(psutil.Error):
                 if psutil.Process(number).status() != psutil.STATUS_ZOMBIE:
                     return True
         return False
 
+    def _end_if_busy(self, is_busy: Callable[[], bool]) -> None:
+        """Kill the idle worker if it has died, or uses CPU time."""
+        if self._is_warm:
+            self._was_busy |= is_busy()
+            if self._was_busy or self._is_dead():
+                self._kill()
+
     def _cpu_seconds(self) -> float:
-        """Return the CPU time of all threads of the worker."""
-        with suppress(psutil.Error):  # the worker may have ended
-            times = psutil.Process(self._worker).cpu_times()
-            return float(times.user + times.system)
+        """Return the CPU time of all threads of the worker; 0 if it has ended."""
+        with suppress(psutil.Error):
+            return float(sum(self._worker.cpu_times()[:2]))
         return 0.0
 
-    def _end_if_busy(self) -> None:
-        """Kill the worker if it has died, or used CPU time since its last answer."""
-        if self._idle_since is None:
-            return
+    def _has_been_busy(self) -> bool:
         since, used = self._idle_since
-        allowed = max(
-            MIN_BUSY_CPU_SECONDS, MAX_IDLE_CPU_SHARE * (time.monotonic() - since)
-        )
-        self._was_busy |= self._cpu_seconds() - used > allowed
-        if self._was_busy or self._is_dead():
-            self._kill()
+        # the kernel reports multiples of 0.01 s
+        elapsed = time.monotonic() - since + 2 * POLL_SECONDS
+        return self._cpu_seconds() - used > MAX_IDLE_CPU_SHARE * elapsed
 
     def _stays_busy(self) -> bool:
-        """Return True if threads of the worker continue to compute after its answer.
+        """Return True if threads of the idle worker continue to compute.
 
         Threads of pools may spin before they sleep, for at most `SETTLE_SECONDS`.
         """
@@ -466,7 +466,7 @@ class WorkerProcess:
     def _runs(self) -> bool:
         """Return True if a thread of the worker runs, or waits for a CPU."""
         with suppress(psutil.Error):
-            threads = [t.id for t in psutil.Process(self._worker).threads()]
+            threads = [t.id for t in self._worker.threads()]
             return "running" in [psutil.Process(t).status() for t in threads]
         return False
 
@@ -503,7 +503,7 @@ class WorkerProcess:
         """Close the pipes, and forget the process and its state."""
         for fd in {self._requests, self._replies} - {-1}:
             os.close(fd)
-        self._process, self._worker, self._idle_since = None, 0, None
+        self._process = self._worker = None
         self._requests = self._replies = -1
         self._unread = b""
         self._is_warm = self._keeps_ranks = False
@@ -512,29 +512,22 @@ class WorkerProcess:
 os.register_at_fork(after_in_child=WorkerProcess.forget_all)
 
 
+@dataclass(eq=False)
 class _WorkerEndError(Exception):
-    """End of a worker before an expected event.
+    """End of a worker before an expected event."""
 
-    event : name of the expected event
-    verdict : verdict on the solver, if the solve had started
-    how : description of the end
-    name : signal that ended the worker, or ""
-    stage : prefix of the message
-    """
+    event: str  #: name of the expected event
+    verdict: Verdict  #: verdict on the solver, if the solve had started
+    message: str  #: description of the end
+    signal: str = ""  #: name of the signal that ended the worker; else empty
+    is_fault: bool = False  #: True if the worker reported a fault of the harness
+    is_oom: bool = False  #: True if the kernel killed the worker for lack of memory
+    stage: str = ""  #: prefix of the message
 
-    def __init__(
-        self, event: str, verdict: Verdict, how: str, name: str, stage: str
-    ) -> None:
-        self.event = event
-        self.is_early = event in ("ready", "warm", "start")
-        super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
-        if self.is_early and verdict is Verdict.TIME_LIMIT:
-            # the limit `START_SECONDS` has expired, not the limit of the suite
-            verdict = Verdict.FAILED
-        self.verdict = verdict
-        self.signal = name
-        self.is_fault = False  #: True if the worker reported a fault of the harness
-        self.is_oom = False  #: True if the kernel killed the worker for lack of memory
+    @property
+    def is_early(self) -> bool:
+        """True if the worker ended before it started to execute the request."""
+        return self.event in ("ready", "warm", "start")
 
 
 def _memory_mib(tree: list[int], limit: float) -> float:
@@ -563,11 +556,9 @@ def _pipe() -> tuple[int, int]:
     of this stream, and the standard streams of the worker would replace the pipe.
     """
     ends = os.pipe()
-    try:
-        read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _MIN_FD) for e in ends)
-    finally:
-        for end in ends:
-            os.close(end)
+    read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _MIN_FD) for e in ends)
+    for end in ends:
+        os.close(end)
     return read, write
 
 

@@ -54,7 +54,7 @@ from mortarbench.harness.processes.protocol import (
     answer_requests,
     source_of,
 )
-from mortarbench.harness.processes.ranks import Build, RanksAsOne, this_rank
+from mortarbench.harness.processes.ranks import Build, Ranks
 from mortarbench.harness.qp import QP, no_rows
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import (
@@ -81,16 +81,15 @@ def serve(
     if build is None:
         answer_requests(worker.answer, request_fd, reply_fd)
         return
-    host = this_rank(build, _limit_memory)
-    if host.comm.rank:
+    ranks = worker.ranks = Ranks(build, _limit_memory)
+    if ranks.comm.rank:
         os.close(request_fd)
         os.close(reply_fd)
         worker.warm_up()
-        serve_rank(host.comm, host)
+        serve_rank(ranks.comm, ranks)
         return
-    worker.ranks = RanksAsOne(host)
     answer_requests(worker.answer, request_fd, reply_fd)
-    worker.ranks.end()
+    ranks.comm.order(None)  # end the service of the other ranks
 
 
 @dataclass(eq=False, kw_only=True)
@@ -104,7 +103,7 @@ class Worker:
     cases: Cases | None = None  #: None if only a solver is measured
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     #: the MPI ranks that solve together; None in a single process
-    ranks: RanksAsOne | None = None
+    ranks: Ranks | None = None
     _chain: Prepare | None = None  # solver of the current sequence
     _last_step: int = -1  # index of the last measured step of the sequence
     # digest, inode, size and modification time of each verified file
@@ -167,10 +166,12 @@ class Worker:
             ctypes.CDLL(None).malloc_trim(0)
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
         assert self.solver is not None
-        ranks, solver, set_limit = self.ranks, self.solver, _limit_memory
+        ranks, solver = self.ranks, self.solver
+        set_limit: Callable[[float | None], None] = _limit_memory
         if ranks is not None:
             send("built", **ranks.build(request["case"]))
-            qp, solver, set_limit = ranks.qp, ranks.solver(solver), ranks.limit
+            solver, qp = ranks.problem(solver)
+            set_limit = partial(ranks.call, "limit")
         else:
             qp = self._load(request)
         set_limit(request.get("memory_limit"))

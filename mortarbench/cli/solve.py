@@ -15,7 +15,7 @@ from mortarbench.harness.names import assemble
 from mortarbench.harness.registry import check_name
 from mortarbench.harness.suite.solver_options import options_for
 from mortarbench.progress import waiting
-from mortarbench.registries import Registries, defer_parts_of_numpy
+from mortarbench.registries import Registries
 from mortarbench.text import convergence, legend
 
 if TYPE_CHECKING:
@@ -55,7 +55,6 @@ def solve(
     problem = as_case(case, registries=registries)
     check_name(solver, registries.solvers)
     options = options_for(solver, option, registries.solvers)
-    defer_parts_of_numpy()
     pictures = [f"--{name}" for name in ("plot", "vtu") if files[name] is not None]
     if pictures and problem.family_case.fields is None:
         raise InputError(

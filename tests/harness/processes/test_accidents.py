@@ -21,9 +21,9 @@ from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import supervisor
 from mortarbench.harness.processes.measurement import (
     measure_and_judge,
-    scratch_folder,
 )
 from mortarbench.harness.processes.protocol import ForeignReplyError, event_of
+from mortarbench.harness.processes.scratch import scratch_folder
 from mortarbench.harness.processes.supervisor import (
     REPLACEMENT_NOTE,
     WorkerProcess,
@@ -153,7 +153,8 @@ class Bench:
         )[0]  # fmt: skip
 
     def process(self, solver):
-        return self.workers[solver]._worker
+        worker = self.workers[solver]._worker
+        return worker and worker.pid
 
     def close(self):
         for worker in self.workers.values():
@@ -261,7 +262,7 @@ def test_sleeping_threads_may_stay_and_busy_threads_may_not(bench):
     bench("burns")
 
     assert bench.process("pools") == pool
-    assert bench.process("burns") == 0
+    assert bench.process("burns") is None
 
 
 def test_a_time_that_the_parents_clock_contradicts_is_replaced(bench):
@@ -421,9 +422,8 @@ def test_scratch_folders_of_killed_processes_are_removed_at_the_next_start(
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    stale = tmp_path / "mortarbench-scratch-1"
+    stale = tmp_path / "mortarbench-tmp-1"
     stale.mkdir()
-    (stale / "in-use").touch()
     with scratch_folder() as used, scratch_folder():
         assert sorted(tmp_path.iterdir()).count(used) == 1
         assert not stale.exists()
