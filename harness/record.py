@@ -23,8 +23,8 @@ LEVELS = 8  #: largest depth of nested lists and tables in a field
 #: fields whose values are equal in many lines; equal values are stored only once in
 #: memory
 _REPEATED = (
-    "case", "family", "form", "solver", "claimed", "mode", "qp", "environment",
-    "session", "params", "sizes", "options", "counts", "certificate", "quantities",
+    "case", "family", "form", "solver", "method", "claimed", "mode", "qp", "session",
+    "environment", "params", "sizes", "options", "counts", "certificate", "quantities",
 )  # fmt: skip
 
 
@@ -126,6 +126,7 @@ class Record(Struct, frozen=True, kw_only=True):
         Mapping[str, _Count], _about("numbers of unknowns and constraints")
     ]
     solver: Annotated[str, _about("label of the solver in the suite")]
+    method: Annotated[str, _about("name of the solver in the registry")] = ""
     options: Annotated[
         Mapping[str, _Nested], _about("all options of the solver, including defaults")
     ]

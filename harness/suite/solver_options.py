@@ -286,18 +286,6 @@ def with_options(label: str, options: Mapping[str, Any]) -> str:
     return " ".join([label, *(f"{k}={_text(v)}" for k, v in options.items())])
 
 
-def without_options(label: str) -> Iterator[str]:
-    """Yield a label, then the label without its last option, last two options, etc.
-
-    >>> list(without_options("LABEL max_iter=50 scaling=true"))
-    ['LABEL max_iter=50 scaling=true', 'LABEL max_iter=50', 'LABEL']
-
-    """
-    yield label
-    while (shorter := re.sub(r" [^\W\d]\w*=\S*$", "", label)) != label:
-        yield (label := shorter)
-
-
 def _text(value: object) -> str:
     """Return a value as a text without blanks, since labels are split at blanks."""
     match value:

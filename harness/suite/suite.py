@@ -278,24 +278,6 @@ def _value(where: str, value: Any) -> str:
     )
 
 
-def steps_up_to(
-    file: SuiteFile, name: CaseId, families: Mapping[str, Family]
-) -> tuple[CaseId, ...]:
-    """Return the steps of a sequence from its first case to the case `name`, inclusive.
-
-    Raises
-    ------
-    InputError
-        If no sequence contains the case.
-
-    """
-    cases = expand_problems(file.problems, families, Path(), file.max_cases)
-    for steps in cases.sequences:
-        if name in steps:
-            return steps[: steps.index(name) + 1]
-    raise InputError("the suite has no sequence with that case")
-
-
 def _solvers(file: SuiteFile, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:
     """Return the solvers of a suite on each number of ranks, with distinct labels.
 

@@ -73,6 +73,7 @@ def new_record(
         form=case.form,
         sizes={},
         solver=spec.label,
+        method=spec.name,
         options=options,
         tol=tol,
         repeat=repeat,

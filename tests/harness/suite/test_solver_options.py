@@ -15,7 +15,6 @@ from mortarbench.harness.suite.solver_options import (
     options_for,
     parse_options,
     sweep,
-    without_options,
 )
 
 
@@ -182,12 +181,6 @@ def test_options_of_a_program_are_those_of_the_command_line():
     )
     (null,) = sweep(SPECS[:1], listed_options({"seed": None}), SOLVERS)
     assert null.options == {"seed": None}
-
-
-def test_the_label_of_the_suite_is_found_in_a_longer_one():
-    assert list(without_options("my way x=1 max_iter=5")) == [
-        "my way x=1 max_iter=5", "my way x=1", "my way"
-    ]  # fmt: skip
 
 
 @dataclass(frozen=True)
