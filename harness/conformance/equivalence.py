@@ -2,11 +2,9 @@
 
 The problem of two strings in contact (`harness.conformance.manufactured.strings`) is
 solved in each form. The QP is solved unchanged and after each of the `CHANGES`, which
-yield equivalent QPs. The verdicts and the answers must be equal. The answer x to a
-changed QP is mapped to the unchanged QP and compared with its answer x₀. If both
-answers are verified, their residuals bound two quantities relative to the energies of
-the answers: the difference of the objectives, and the energy ½‖x − x₀‖²_P of the
-difference.
+yield equivalent QPs. The verdicts must be equal. Verified answers are then equal as
+well: their residuals bound the energy ½‖x − x₀‖²_P of the difference, where x is the
+answer to the changed QP, mapped to the unchanged QP with the answer x₀.
 """
 
 from __future__ import annotations
@@ -29,16 +27,13 @@ from mortarbench.harness.conformance.metamorphic import (
     shift_unknowns,
 )
 from mortarbench.harness.plugin import Solver
-from mortarbench.harness.qp import QP, Vector
-from mortarbench.harness.record import VERIFIED_FACTOR, Verdict
+from mortarbench.harness.qp import QP
+from mortarbench.harness.record import Verdict
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import DeclinedError, solve_once
 
 TOL = 1e-8  #: tolerance of all solves of the strings
-#: Largest permitted difference, relative to the energies. The factor of 10 accounts for
-#: the sum of residuals over rows.
-MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
 
 #: Load (10⁸ N/m) and length (2 m) of beam-ring, expressed in each system of units and
 #: rounded to powers of two. Forces are per unit thickness, so that the unit of
@@ -51,13 +46,13 @@ UNITS: Mapping[str, tuple[float, float]] = {
 
 
 class WeaknessError(Exception):
-    """Error for a verdict or answer that changes under an equivalent formulation."""
+    """Error for a verdict that changes under an equivalent formulation."""
 
 
-def same_answer(
+def same_verdict(
     form: str, change: str, solver: Solver
 ) -> tuple[int | None, int | None]:
-    """Solve the unchanged and the changed string problem, and compare the answers.
+    """Solve the unchanged and the changed string problem, and compare the verdicts.
 
     change : a key of `CHANGES`
 
@@ -73,8 +68,7 @@ def same_answer(
     SolverError
         If the solver raises an exception.
     WeaknessError
-        If the answer to the changed QP is not verified, or differs from the answer to
-        the unchanged QP.
+        If the answer to the changed QP is not verified.
 
     """
     qp = strings(form)
@@ -86,11 +80,6 @@ def same_answer(
     s = old if change == UNCHANGED else solve_once(solver, new.qp, TOL)[0]
     if after := _fault(new.qp, s):
         raise WeaknessError(after)
-    recovered = new.recover(s)
-    energy = max(_energy(qp, old.x), new.scale * _energy(new.qp, s.x))
-    dx = recovered.x - old.x
-    _compare("objective", abs(qp.objective(recovered.x) - qp.objective(old.x)) / energy)
-    _compare("½‖x − x₀‖²_P", 0.5 * float(dx @ (qp.P @ dx)) / energy)
     return old.iterations, s.iterations
 
 
@@ -105,18 +94,6 @@ def _fault(qp: QP, s: Solution) -> str:
         return end
     name, worst = max(residuals._asdict().items(), key=lambda item: item[1])
     return f"{end}, {judged}: {name} residual {worst:.1e} at tol {TOL:g}"
-
-
-def _energy(qp: QP, x: Vector) -> float:
-    return float(max(abs(x @ (qp.P @ x)), abs(qp.q @ x)))
-
-
-def _compare(quantity: str, change: float) -> None:
-    if not change <= MAX_ENERGY_CHANGE:
-        raise WeaknessError(
-            f"verified, but {quantity} changed by {change:.1e} of the energy; "
-            f"expected at most {MAX_ENERGY_CHANGE:g}"
-        )
 
 
 def _units(name: str, qp: QP, form: str) -> Equivalent:

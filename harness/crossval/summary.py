@@ -80,13 +80,14 @@ def _headline(counts: dict[str, int], answers: Sequence[Answer]) -> str:
         noun: f"{n} {noun}{'s' * (n != 1)}"
         for noun, n in (
             *((noun, counts[f"{noun}s"]) for noun in ("answer", "solver", "case")),
+            ("claim", counts["proven"]),
             ("refuted claim", counts["refuted"]),
             ("contradicted certificate", counts["contradicted"]),
         )
     }
     what = f"{many['answer']} of {many['solver']} to {many['case']}"
     if counts["proven"]:
-        what += f", and {counts['proven']} proofs of infeasibility"
+        what += f", {many['claim']} of infeasibility proven"
     culprits = sorted({a.solver for a in answers if a.outcome is Outcome.REFUTED})
     wrong = [
         *[f"{many['refuted claim']} of {some(culprits, 6)}"] * bool(culprits),

@@ -29,7 +29,7 @@ from mortarbench.harness.files.store import (
     point_arrays,
 )
 from mortarbench.harness.plugin import Case, Family, Reference
-from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.record import PROVEN, Record, Verdict
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.stored_run import rebuild
 from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
@@ -97,32 +97,29 @@ def _group(
 
     Forms with equal mechanics are one problem. Without mechanics, each form is one.
     """
-    cases, judged = _built(records, build)
-    lost = {a.run_id for a in judged}
+    cases: dict[str, Case | InputError] = {}
+    judged: list[Answer] = []
+    pointless: list[tuple[Record, Case | None]] = []
     seen: set[tuple[str, str, float, str]] = set()
     by_problem: dict[str, list[StoredAnswer]] = {}
-    pointless = []
     for r in records:
-        if r.identity in lost:
-            continue
-        if not r.vectors or not (
-            r.claimed == Status.SOLVED or r.status is Verdict.VERIFIED
-        ):
-            pointless.append(r)
-            continue
-        key = (r.solver, r.case, r.tol, r.vectors)
+        claims_point = r.claimed == Status.SOLVED or r.status is Verdict.VERIFIED
+        key = (r.solver, r.case, r.tol, r.vectors or r.identity)
         if key in seen:  # the point of an earlier repeat
             continue
         seen.add(key)
-        case = cases[r.case]
         try:
-            g = _stored_answer(path, r, case)
+            case = _case(r, cases, build) if r.vectors or r.status in PROVEN else None
+            if not r.vectors or not claims_point or case is None:
+                pointless.append((r, case))
+                continue
+            elastic = case.mechanics
+            problem = r.case if elastic is None else qp_digest(elastic.program)
+            answer = _stored_answer(path, r, case)
         except InputError as e:
             judged.append(answer_of(r, Outcome.NOT_VALIDATED, str(e)))
             continue
-        elastic = case.mechanics
-        problem = r.case if elastic is None else qp_digest(elastic.program)
-        by_problem.setdefault(problem, []).append(g)
+        by_problem.setdefault(problem, []).append(answer)
     solved: dict[str, float] = {}  # error bounds of the references by case
     for problem, answers in by_problem.items():
         compared = compare_answers(answers, reference)
@@ -132,11 +129,11 @@ def _group(
         bounds = [b for a in compared if (b := a.reference_error) is not None]
         solved |= dict.fromkeys(names, min(bounds, default=inf))
     return judged + [
-        _without_point(r, cases, solved.get(r.case, inf)) for r in pointless
+        _without_point(r, case, solved.get(r.case, inf)) for r, case in pointless
     ]
 
 
-def _without_point(r: Record, cases: Mapping[str, Case], solved: float) -> Answer:
+def _without_point(r: Record, case: Case | None, solved: float) -> Answer:
     """Judge a measurement without a point.
 
     solved : error bound of a solution of the problem; inf if there is none
@@ -144,11 +141,10 @@ def _without_point(r: Record, cases: Mapping[str, Case], solved: float) -> Answe
     if r.claimed == Status.SOLVED:
         text = "claims success without a finite point"
         return answer_of(r, Outcome.REFUTED, text)
-    if _is_proven(r):
+    if r.status in PROVEN and case is not None:
         # the run did not store the certificate of the solver: search for a new one
-        qp = cases[r.case].qp
-        claim = Solution.without_point(qp, Status(r.claimed or "infeasible"))
-        holds, why = certificate_of(qp, claim, r.judged_at)
+        claim = Solution.without_point(case.qp, Status(r.claimed or "infeasible"))
+        holds, why = certificate_of(case.qp, claim, r.judged_at)
         if holds:
             return answer_of(r, Outcome.PROVEN, why)
     if r.claimed in NO_SOLUTION and solved < MAX_SOLUTION_ERROR:
@@ -157,46 +153,33 @@ def _without_point(r: Record, cases: Mapping[str, Case], solved: float) -> Answe
             f"at most {brief(solved)}"
         )
         return answer_of(r, Outcome.REFUTED, text)
-    if _is_proven(r):
+    if r.status in PROVEN:
         text = "the certificate could not be computed again"
         return answer_of(r, Outcome.NOT_VALIDATED, text)
     text = ": ".join(filter(None, (r.status.words, r.message)))
     return answer_of(r, Outcome.UNANSWERED, text)
 
 
-def _built(
-    records: Iterable[Record], build: Build
-) -> tuple[dict[str, Case], list[Answer]]:
-    """Rebuild the cases of the answers.
+def _case(r: Record, cases: dict[str, Case | InputError], build: Build) -> Case:
+    """Return the rebuilt case of a record; raise InputError if its QP is another one.
 
-    Returns the cases by name, and the answers that cannot be judged: their case cannot
-    be rebuilt, or their QP is another one.
+    cases : cases built so far by name, or the reason why they cannot be built
     """
-    cases: dict[str, Case] = {}
-    digests: dict[str, str] = {}
-    faults: dict[str, str] = {}
-    lost = []
-    for r in records:
-        if not (r.vectors or _is_proven(r)):
-            continue
-        if r.case not in cases and r.case not in faults:
-            try:
-                case = build(r)
-            except InputError as e:
-                faults[r.case] = str(e)
-            else:
-                cases[r.case] = case
-                digests[r.case] = case.digest or qp_digest(case.qp, serialised=True)
-        fault = faults.get(r.case)
-        if fault is None and r.qp not in (None, now := digests[r.case]):
-            fault = (
-                f"its QP has the digest {now} now, {r.qp} when it was measured; "
-                "expected the same version of the code, of its libraries and of "
-                "plug-ins"
-            )
-        if fault is not None:
-            lost.append(answer_of(r, Outcome.NOT_VALIDATED, fault))
-    return cases, lost
+    if r.case not in cases:
+        try:
+            cases[r.case] = build(r)
+        except InputError as e:
+            cases[r.case] = e
+    case = cases[r.case]
+    if isinstance(case, InputError):
+        raise case
+    now = case.digest or qp_digest(case.qp, serialised=True)
+    if r.qp not in (None, now):
+        raise InputError(
+            f"its QP has the digest {now} now, {r.qp} when it was measured; expected "
+            "the same version of the code, of its libraries and of plug-ins"
+        )
+    return case
 
 
 def _stored_answer(path: Path, r: Record, case: Case) -> StoredAnswer:
@@ -210,11 +193,6 @@ def _stored_answer(path: Path, r: Record, case: Case) -> StoredAnswer:
     return StoredAnswer(
         record=r, case=case, solution=s, remark=_CHANGED if changed else ""
     )
-
-
-def _is_proven(r: Record) -> bool:
-    """Return True if the run proved the claim that the QP has no solution."""
-    return r.status.is_verified and r.status is not Verdict.VERIFIED
 
 
 def _apart(r: Record) -> Record:
