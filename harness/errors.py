@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import re
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from difflib import get_close_matches
 
-MAX_SHOWN = (
-    200  #: largest number of characters of the user's input that a message repeats
-)
-_MAX_MESSAGE = 600  #: largest number of characters of a message, excluding paths
-#: A quotation or a word. Possessive quantifiers avoid backtracking, which could take
-#: very long for malicious input.
-_PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
+MAX_SHOWN = 200  #: largest number of characters of input that a message repeats
+MAX_MESSAGE = 1000  #: largest number of characters of a message; paths fit
 
 
 class InputError(Exception):
@@ -68,25 +61,8 @@ def shortened(text: str, most: int = MAX_SHOWN) -> str:
 
 
 def one_line(message: str) -> str:
-    """Return a message as a single line of limited length.
-
-    Long words and quotations are shortened first, except for existing paths, since
-    users copy them. If the rest of the line is still too long, the line is shortened.
-    """
-    line = " ".join(message.splitlines())
-    if len(line) <= MAX_SHOWN:
-        return line
-    paths: list[str] = []
-
-    def brief(piece: re.Match[str]) -> str:
-        text = piece[0]
-        if len(text) > MAX_SHOWN and os.path.lexists(text.strip("'\"").rstrip(":,;")):
-            paths.append(text)
-            return text
-        return shortened(text)
-
-    line = _PIECES.sub(brief, line)
-    return shortened(line, _MAX_MESSAGE + sum(map(len, paths)))
+    """Return a message as a single line of at most `MAX_MESSAGE` characters."""
+    return shortened(" ".join(message.splitlines()), MAX_MESSAGE)
 
 
 #: Hint after the list of known solvers or families in an error message.

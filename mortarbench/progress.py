@@ -168,25 +168,20 @@ class _Notebook(_Bar):
         from IPython.display import HTML, display
 
         self._html = HTML
-        self._lines: list[str] = []
         self._updated = -_UPDATE_SECONDS
         self._handle = display(HTML(""), display_id=True)
 
     def warn(self, text: str) -> None:
-        self._lines.append(text)
+        print(text)
 
     def changed(self, record: Record | None = None) -> None:
         super().changed(record)
         if monotonic() - self._updated < _UPDATE_SECONDS and self.done < self.total:
             return
         self._updated = monotonic()
-        above = "".join(f"<div>{escape(line)}</div>" for line in self._lines)
-        self._handle.update(
-            self._html(
-                f"{above}<progress value='{self.done}' max='{self.total or 1}'>"
-                f"</progress> {self.done}/{self.total} {self.left()} {escape(self.now)}"
-            )
-        )
+        bar = f"<progress value='{self.done}' max='{self.total or 1}'></progress>"
+        text = escape(f"{self.done}/{self.total} {self.left()} {self.now}")
+        self._handle.update(self._html(f"{bar} {text}"))
 
 
 def remaining(measured: int, to_do: int, seconds: float) -> str:

@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness.record import Record, Verdict, in_space
@@ -39,8 +40,6 @@ UNITS = {
     "stress_error": "(dimensionless)",
 }
 _CONTACTS = "contacts"  #: quantity that maps each contact pair to a table of results
-#: quantity that is printed on the line of `sliding_without_contact`
-_SHARE = "shear_without_contact"
 _CONTACT_UNITS = {
     "largest_pressure": "Pa",
     "mean_pressure": "Pa",
@@ -50,28 +49,31 @@ _CONTACT_UNITS = {
 }
 
 
-_HEADS = {
-    "free_gradient": "‖φ‖",
-    "chopped_gradient": "‖β‖",
-    "infeasibility": "‖Ax−b‖",
-    "active": "at bound",
-    "two_sided": "of two",
-    "cost": "own cost",
-}
-_LEGEND = {
-    "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning, "
-    "n Newton",
-    "outer": "outer: number of the outer iteration",
-    "products": "products: number of products with the QP's matrix P so far",
-    "free_gradient": "‖φ‖: free gradient (norm), of the variables not at a bound",
-    "chopped_gradient": "‖β‖: chopped gradient (norm), of the variables that should "
-    "leave their bounds",
-    "infeasibility": "‖Ax−b‖: relative violation of the equality rows",
-    "active": "at bound: number of variables at one of their bounds",
-    "two_sided": "of two: number of variables at a bound that have two bounds; with "
-    "friction, number of rows that slip",
-    "cost": "own cost: value of the function that the solver itself minimises, in its "
-    "own\n          scaling; neither a time nor the objective above",
+#: heading and meaning of the columns of a history, by name
+_COLUMNS = {
+    "step": (
+        "step",
+        "c conjugate gradients, e expansion, f fallback, p proportioning, n Newton",
+    ),
+    "outer": ("outer", "number of the outer iteration"),
+    "products": ("products", "number of products with the QP's matrix P so far"),
+    "free_gradient": ("‖φ‖", "free gradient (norm), of the variables not at a bound"),
+    "chopped_gradient": (
+        "‖β‖",
+        "chopped gradient (norm), of the variables that should leave their bounds",
+    ),
+    "infeasibility": ("‖Ax−b‖", "relative violation of the equality rows"),
+    "active": ("at bound", "number of variables at one of their bounds"),
+    "two_sided": (
+        "of two",
+        "number of variables at a bound that have two bounds; with friction, number of "
+        "rows that slip",
+    ),
+    "cost": (
+        "own cost",
+        "function that the solver itself minimises, in its own scaling; neither a "
+        "time nor the objective above",
+    ),
 }
 #: columns of a history that are not shown, because times of single runs are unreliable
 _HIDDEN = ("seconds",)
@@ -184,9 +186,9 @@ def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
         ("solver error", _bound(r)),
         ("objective", _text(_none_if_nan(r.objective))),
         *(
-            (name.replace("_", " "), _quantity(r, name, units.get(name, "")))
-            for name in r.quantities
-            if name not in (_CONTACTS, _SHARE)
+            (name.replace("_", " "), _text(value, units.get(name, "")))
+            for name, value in r.quantities.items()
+            if name != _CONTACTS
         ),
         *_contacts(r.quantities.get(_CONTACTS), f"N{per}"),
     ]
@@ -199,18 +201,6 @@ def _units(per: str) -> Mapping[str, str]:
     per : "/m" for plane bodies, whose forces are per metre of thickness; "" in 3D
     """
     return {name: unit.replace("/m", per) for name, unit in UNITS.items()}
-
-
-def _quantity(r: Record, name: str, unit: str) -> str:
-    """Return the value of a quantity as text.
-
-    The number of nodes that slide without contact is followed by the fraction of all
-    shear that they carry.
-    """
-    text, share = _text(r.quantities[name], unit), r.quantities.get(_SHARE)
-    if name != "sliding_without_contact" or not isinstance(share, float):
-        return text
-    return f"{text}, with {share:.2%} of the shear"
 
 
 def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
@@ -267,14 +257,16 @@ def convergence(history: History) -> str:
             if values.dtype.kind == "U"
             else [_entry(name, values[end].item()) for end in ends]
         )
-        cells.append([_HEADS.get(name, name.replace("_", " ")), *texts])
+        head, _ = _COLUMNS.get(name, (name.replace("_", " "), ""))
+        cells.append([head, *texts])
     return align(zip(*cells, strict=True), right=range(len(cells)))
 
 
 def legend(history: History) -> str:
     """Return the legend of `convergence`: the explanations of its columns."""
-    lines = (text for k, text in _LEGEND.items() if k in history and history[k].size)
-    return "\n".join(lines)
+    columns = (v for k, v in _COLUMNS.items() if k in history and history[k].size)
+    lines = (f"{head}: {meaning}" for head, meaning in columns)
+    return "\n".join(fill(line, 80, subsequent_indent="  ") for line in lines)
 
 
 def _milestones(history: History) -> list[int]:

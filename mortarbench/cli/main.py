@@ -31,41 +31,17 @@ from mortarbench.registries import Registries, defer_parts_of_numpy, installed
 COMMANDS = {
     "list": ("list.list_", "list the available problems, solvers or suites"),
     "run": ("run.run", "measure a suite and write a report on the results"),
-    "solve": (
-        "solve.solve",
-        "run one solver on one case, once, and verify its answer",
-    ),
-    "export": (
-        "export.export",
-        "write the QP of a case to a file for other programs",
-    ),
-    "validate": (
-        "folders.validate",
-        "compare the answers in a result folder with reference solutions",
-    ),
-    "report": (
-        "folders.report",
-        "write the report on a result folder, or on changes between result folders",
-    ),
-    "replay": (
-        "folders.replay",
-        "repeat one stored measurement and compare it with the old one",
-    ),
+    "solve": ("solve.solve", "run one solver on one case and verify its answer"),
+    "export": ("export.export", "write the QP of a case for other programs"),
+    "validate": ("folders.validate", "compare answers with reference solutions"),
+    "report": ("folders.report", "write a report on a result folder, or on changes"),
+    "replay": ("folders.replay", "repeat one stored measurement and compare both"),
     "merge": ("folders.merge", "merge several result folders into one"),
-    "test-solver": (
-        "test_solver.test_solver",
-        "run the conformance suite on solvers: QPs with known solutions",
-    ),
+    "test-solver": ("test_solver.test_solver", "run the conformance suite on solvers"),
     "paper": ("paper.paper", "reproduce all figures and tables of the paper"),
-    "doctor": (
-        "doctor.doctor",
-        "check whether this machine is suitable for measurements",
-    ),
+    "doctor": ("doctor.doctor", "check whether this machine is fit for measurements"),
     "new": ("new.new", "write a template for a solver, a problem or a suite"),
-    "completion": (
-        "completion.completion",
-        "print a script that completes commands in bash or zsh",
-    ),
+    "completion": ("completion.completion", "print a script for bash or zsh"),
 }
 
 

@@ -299,13 +299,13 @@ def test_the_memory_limit_for_cases_can_be_raised(monkeypatch):
         parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
 
 
-def test_a_message_shortens_long_input_except_existing_paths(tmp_path):
+def test_a_message_is_one_line_of_limited_length_in_which_paths_fit(tmp_path):
     deep = tmp_path / ("d" * 200) / ("e" * 200)
     deep.mkdir(parents=True)
 
     assert one_line(f"{deep}: what\nis it") == f"{deep}: what is it"
-    assert "q" * 201 not in one_line(f"unknown thing {'q' * 5000!r}; known: a, b")
-    assert len(one_line("word " * 5000)) < 700
+    assert one_line(f"unknown {'q' * 5000!r}; known: a, b").endswith("; known: a, b")
+    assert len(one_line("word " * 5000)) == 1000
     assert shown([1] * 5000).startswith("[1, 1")
     assert len(shown([1] * 5000)) == 200
     nested = []
@@ -331,12 +331,9 @@ def test_a_message_shortens_long_input_except_existing_paths(tmp_path):
         ("run", "demo", "--memory-limit", "1e400"), ("run", "demo", "--solver", ""),
     ],
 )  # fmt: skip
-def test_no_command_ends_with_a_traceback_or_repeats_a_long_input(
-    refused, tmp_path, argv
-):
+def test_no_command_ends_with_a_traceback_or_a_long_message(refused, tmp_path, argv):
     os.mkfifo(tmp_path / "pipe")
 
     message = refused(*argv)
 
-    assert not any(letter * 201 in message for letter in "stuvwxyz9")
     assert len(message) < 1500

@@ -225,7 +225,7 @@ def test_solve_prints_counters_and_a_table_of_convergence(cli):
     ]
     for word in ("e expansion", "‖φ‖: free", "‖β‖: chopped", "at bound:", "own cost:"):
         assert word in legend
-    assert "the function that the solver itself minimises" in legend
+    assert "function that the solver itself minimises" in legend
     assert max(map(len, legend.splitlines())) <= 80
 
 
