@@ -69,7 +69,7 @@ STAGES = ("mesh", "dual", "prepare", "solve", "recover", "certify")
 def problem_of(family, size):
     """Return the contact problem of one size."""
     keys, _ = FAMILIES[family]
-    return PROBLEMS[family].contact_problem(PROBLEMS[family].complete(keys(size)))
+    return PROBLEMS[family].with_keys(**keys(size)).contact_problem()
 
 
 def one(way, family, size, cells):

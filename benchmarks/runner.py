@@ -83,7 +83,7 @@ def measure(out, *solvers, repeats, plugin=PLUGIN):
     suite = Suite(
         name="runner", tolerances=(1e-6,), repeats=repeats, time_limit=60.0,
         memory_limit=4096.0, solvers=tuple(specs), text="",
-        cases=(assemble(tiny, {}, "plain"),),
+        cases=(assemble("tiny", tiny, {}, "plain"),),
     )  # fmt: skip
     watch = Watch()
     run(

@@ -21,7 +21,7 @@ from mortarbench.problems.contact.bodies import factorise_clamped, factorise_flo
 from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import primal_qp
-from mortarbench.problems.models.beam_ring import model
+from mortarbench.problems.families.beam_ring import model
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 WAYS = {

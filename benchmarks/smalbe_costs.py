@@ -115,8 +115,8 @@ def timed(call: Callable[[], object], repeats: int = 1) -> Callable[[], float]:
 def beam_ring(form: str, Nr: int, Nh: int, step: int) -> QP:
     """Return a QP of the paper's benchmark, a beam on a half ring."""
     family = PROBLEMS["beam-ring"]
-    params = family.complete({"Nr": Nr, "Nh": Nh, "step": step})
-    return family.build(form, params, reference_solution).qp
+    configured = family.with_keys(Nr=Nr, Nh=Nh, step=step)
+    return configured.build(form, reference_solution).qp
 
 
 def dense(tol: float = 1e-6) -> None:
@@ -167,9 +167,7 @@ def sparse(tol: float = 1e-6) -> None:
     solver = replace(SOLVERS["smalbe"], preconditioner="model")
     for name, params in LARGE.items():
         family = PROBLEMS[name]
-        case = family.build(
-            family.forms[0], family.complete(params), reference_solution
-        )
+        case = family.with_keys(**params).build(family.forms[0], reference_solution)
         _sparse(name, case.qp, solver, tol)
 
 
@@ -223,7 +221,7 @@ def sparse_qp(name: str, params: dict[str, object]) -> QP:
     """
     given = {key: value for key, value in params.items() if key != "half"}
     family = PROBLEMS[name]
-    qp = family.build("primal", family.complete(given), reference_solution).qp
+    qp = family.with_keys(**given).build("primal", reference_solution).qp
     if "half" not in params:
         return qp
     lb = qp.lb.copy()

@@ -20,7 +20,7 @@ from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.stepping import forces_of, load_steps
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import load_path, recovered
-from mortarbench.problems.models.beam_ring import model
+from mortarbench.problems.families.beam_ring import model
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 WAYS = {

@@ -9,6 +9,7 @@ from mortarbench.problems.contact.face_mortar import face_mortar
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.surface import closest_points, divided, surface
+from mortarbench.problems.families.beam_ring import model
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,
@@ -16,7 +17,6 @@ from mortarbench.problems.fem.elasticity import (
 )
 from mortarbench.problems.fem.inverse import regular_inverse
 from mortarbench.problems.fem.mesh import box, join, prefixed
-from mortarbench.problems.models.beam_ring import model
 
 
 @pytest.mark.parametrize("method", [node_to_facet, mortar])

@@ -8,16 +8,15 @@ import pytest
 
 from mortarbench.problems.contact.bodies import factorise_floating
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.families.beam_ring import BeamRing
-from mortarbench.problems.models.beam_ring import model
+from mortarbench.problems.families.beam_ring import BeamRing, model
 from mortarbench.solvers.reference.solve import reference_solution
 
 
 @pytest.fixture(scope="module")
 def steps():
     family = BeamRing()
-    params = [family.complete({"Nr": 30, "Nh": 15, "step": k}) for k in range(1, 11)]
-    return [family.build("primal", p, reference_solution).qp for p in params]
+    params = [family.with_keys(Nr=30, Nh=15, step=k) for k in range(1, 11)]
+    return [p.build("primal", reference_solution).qp for p in params]
 
 
 def test_dualisation_of_ten_steps(race, steps):

@@ -15,7 +15,7 @@ TOL = 1e-8
 
 def built(**keys):
     family = PROBLEMS["half-space"]
-    return family.build("dual", family.complete(keys), reference_solution)
+    return family.with_keys(**keys).build("dual", reference_solution)
 
 
 @pytest.mark.parametrize("n", [64, 256, 512])

@@ -6,9 +6,8 @@ import pytest
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.families.beam_ring import BeamRing
+from mortarbench.problems.families.beam_ring import BEAM, BeamRing, model
 from mortarbench.problems.fem.elasticity import elasticity_matrix, stiffness
-from mortarbench.problems.models.beam_ring import BEAM, model
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -52,8 +51,8 @@ def test_factorisation(benchmark, factorise, Nr, Nh):
 @SIZES
 def test_dualisation(benchmark, Nr, Nh):
     family = BeamRing()
-    params = family.complete({"Nr": Nr, "Nh": Nh, "steps": 1})
-    primal = family.build("primal", params, reference_solution).qp
+    configured = family.with_keys(Nr=Nr, Nh=Nh, steps=1)
+    primal = configured.build("primal", reference_solution).qp
     inverse = factorise_floating(bodies_of(Nr, Nh))
 
     dual = benchmark(dualise, primal, inverse)
@@ -65,8 +64,8 @@ def test_dualisation(benchmark, Nr, Nh):
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 def test_smalbe(benchmark, form, Nr, Nh):
     family = BeamRing()
-    params = family.complete({"Nr": Nr, "Nh": Nh, "steps": 1})
-    qp = family.build(form, params, reference_solution).qp
+    configured = family.with_keys(Nr=Nr, Nh=Nh, steps=1)
+    qp = configured.build(form, reference_solution).qp
 
     solution = benchmark(lambda: SMALBE().prepare(qp, 1e-8)())
 

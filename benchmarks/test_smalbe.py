@@ -33,8 +33,8 @@ OURS = (
 
 def dual(Nr, Nh, step, form="dual"):
     family = PROBLEMS["beam-ring"]
-    params = family.complete({"Nr": Nr, "Nh": Nh, "step": step})
-    return family.build(form, params, reference_solution).qp
+    configured = family.with_keys(Nr=Nr, Nh=Nh, step=step)
+    return configured.build(form, reference_solution).qp
 
 
 def seconds(solver, qp, tol):
@@ -244,7 +244,7 @@ def test_large_sparse_problems(race, note, name):
     """
     family = PROBLEMS[name]
     form = family.forms[0]
-    qp = family.build(form, family.complete(ZOO[name]), reference_solution).qp
+    qp = family.with_keys(**ZOO[name]).build(form, reference_solution).qp
     n, tol = qp.q.size, 1e-6
     fleet = [
         f for f in ("smalbe", "smalbe-permon", "smalbe-espreso", "osqp", "clarabel",

@@ -6,6 +6,4 @@ solvers therefore do not load NumPy and SciPy. `__init__.pyi` lists the exported
 
 from lazy_loader import attach_stub
 
-# Use the full name instead of __name__, since `python -m harness` in a checkout imports
-# this package as `harness`.
-__getattr__, __dir__, __all__ = attach_stub("mortarbench.harness", __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

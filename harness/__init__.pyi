@@ -1,5 +1,8 @@
 from .errors import InputError as InputError
 from .files.qpfile import save_qp as save_qp
+from .keys import DERIVED as DERIVED
+from .keys import Range as Range
+from .keys import Value as Value
 from .limits import memory_limit_mib as memory_limit_mib
 from .limits import too_large as too_large
 from .mechanics import Friction as Friction
@@ -15,7 +18,6 @@ from .plugin import Fields as Fields
 from .plugin import Reference as Reference
 from .plugin import ReferenceOfOperator as ReferenceOfOperator
 from .plugin import Solver as Solver
-from .plugin import Value as Value
 from .qp import QP as QP
 from .qp import Matrix as Matrix
 from .qp import Structure as Structure

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    NamedTuple,
+    Protocol,
+    Self,
+    TypeAlias,
+)
+
+from mortarbench.harness.keys import Value, keys_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +30,6 @@ if TYPE_CHECKING:
     from mortarbench.harness.qp import QP, Vector
     from mortarbench.harness.solution import Solution
 
-Value = int | float | str  #: value of a key in a case name
 #: Function that solves a QP accurately. Families receive it instead of importing a
 #: solver.
 Reference: TypeAlias = "Callable[[QP], Solution]"
@@ -273,100 +282,86 @@ class CaseOnRanks(NamedTuple):
 
 
 class Family(ABC):
-    """A parametrised family of problems, usually a frozen dataclass.
+    """A parametrised family of problems: a frozen dataclass whose fields are its keys.
 
-    Methods raise `InputError` if the value of a key is not supported.
+    Keys are annotated with their type, range and help text (`harness.keys`); the order
+    of the fields is the order of keys in canonical names. The registry contains the
+    family with default values, and a case contains the family with its own values.
+    Methods, including ``__post_init__``, raise `InputError` if values are not
+    supported. The messages do not contain the name of the family, which the caller
+    prepends.
 
     Examples
     --------
-    >>> from collections.abc import Mapping
-    >>> from dataclasses import dataclass, field
-    >>> import numpy as np
+    >>> from dataclasses import dataclass
+    >>> from typing import Annotated, ClassVar
     >>> import mortarbench as mb
-    >>> @dataclass(frozen=True)
+    >>> @dataclass(frozen=True, kw_only=True)
     ... class Spring(mb.Family):
-    ...     name: str = "spring"
-    ...     defaults: Mapping = field(default_factory=lambda: {"k": 2.0})
-    ...     forms: tuple = ("primal",)
+    ...     forms: ClassVar = ("primal",)
+    ...     k: Annotated[float, mb.Range(0, 1e9), "stiffness"] = 2.0
     ...
-    ...     def build(self, form, params, reference):
-    ...         qp = mb.QP.from_arrays([[params["k"]]], [-1])
+    ...     def build(self, form, reference):
+    ...         qp = mb.QP.from_arrays([[self.k]], [-1])
     ...         return mb.Case(
     ...             qp=qp, recover=lambda s: s.x,
     ...             quantities=lambda s: {"u": float(s.x[0])},
     ...         )
-    >>> Spring().complete({})
-    {'k': 2.0}
+    >>> Spring(k=4.0)
+    Spring(k=4.0)
+    >>> Spring(k=-1)
+    Traceback (most recent call last):
+    ...
+    mortarbench.harness.errors.InputError: k=-1 must be between 0 and 1e+09
     """
 
-    name: str  #: name of the family, the first component of the names of its cases
-    #: default values of all keys, in the order of keys in canonical names
-    defaults: Mapping[str, Value]
-    forms: tuple[str, ...]  #: names of the forms of the QP, such as "primal" and "dual"
-    path_suffix: str | None = None  #: suffix of the input files; see `harness.names`
+    forms: ClassVar[tuple[str, ...]]  #: names of the forms, such as "primal" and "dual"
+    #: suffix of the input files; see `harness.names`
+    path_suffix: ClassVar[str | None] = None
+
+    def __post_init__(self) -> None:
+        """Check that every value is in its range; subclasses add further checks."""
+        for name, key in keys_of(type(self)).items():
+            if (value := getattr(self, name)) is not None:
+                key.check(value)
+
+    def derive(self, **values: Value) -> None:
+        """Set the keys that have their default `DERIVED`; call from __post_init__."""
+        for name, value in values.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+
+    def with_keys(self, **values: Value) -> Self:
+        """Return the family with these values, and the defaults of all other keys."""
+        defaults = {name: key.default for name, key in keys_of(type(self)).items()}
+        return replace(self, **(defaults | values))  # type: ignore[type-var]
+
+    @property
+    def params(self) -> dict[str, Value]:
+        """Values of all keys."""
+        return {name: getattr(self, name) for name in keys_of(type(self))}
 
     @abstractmethod
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Build the case with the values `params` of all keys in the given form.
+    def build(self, form: str, reference: Reference) -> Case:
+        """Build the case in the given form.
 
         reference : function that solves a QP accurately, e.g. for previous load steps
         """
-
-    def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return the values of all keys; a default may depend on the keys `given`."""
-        return {**self.defaults, **given}
-
-    def check(self, params: Mapping[str, Value]) -> None:  # noqa: B027  # may be none
-        """Raise `InputError` if a value in `params` is invalid; called before a run."""
-
-    def instead_of(self, key: str) -> str:
-        """Return the key to use instead of a key of other families, or "" if unknown.
-
-        The text is the end of the message about an unknown key.
-        """
-        return ""
 
     def problems_in(self, path: str) -> list[str]:
         """Return the paths of the problems in an input file, such as PATH#1, PATH#2."""
         return [path]
 
-    def subdomains(self, form: str, params: Mapping[str, Value]) -> int:
-        """Return the largest number of ranks that can build the case together.
-
-        params : values of all keys
-        """
+    def subdomains(self, form: str) -> int:
+        """Return the largest number of ranks that can build the case together."""
         return 1
 
     def on_ranks(
-        self, form: str, params: Mapping[str, Value]
+        self, form: str
     ) -> Callable[[Comm, ReferenceOfOperator], CaseOnRanks] | None:
         """Return a function that builds the case on several ranks, or None.
 
         All ranks call the returned function together. None means that a single process
         builds the QP. This method does not build the QP and does not need MPI.
-
-        params : values of all keys
         """
         return None
-
-
-def as_family(offered: Any) -> Family:
-    """Return an object as a `Family`; wrap an object of any other class.
-
-    offered : object with `name`, `defaults`, `forms` and `build`; the other members of
-        `Family` are optional
-    """
-    if isinstance(offered, Family):
-        return offered
-    kind = type(offered)
-    parts = [name for name in dir(Family) if not name.startswith("_")]
-    members = {name: getattr(offered, name) for name in parts if hasattr(offered, name)}
-    required = ("name", "defaults", "forms", "build")
-    members |= {name: getattr(offered, name, None) for name in required}
-    members = {k: staticmethod(v) if callable(v) else v for k, v in members.items()}
-    wrapped: Family = type(
-        kind.__name__, (Family,), {"__doc__": kind.__doc__, **members}
-    )()
-    return wrapped

@@ -22,7 +22,7 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
@@ -37,21 +37,19 @@ from importlib.machinery import (
     SourceFileLoader,
 )
 from pathlib import Path
-from types import CodeType, ModuleType, NoneType, UnionType
+from types import CodeType, ModuleType, NoneType
 from typing import (
     TYPE_CHECKING,
     Any,
-    Literal,
     TypeVar,
-    Union,
-    get_args,
-    get_origin,
     get_type_hints,
 )
 
+from mortarbench.harness.checked import located
 from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.errors import PLUGINS, InputError, shown, unknown
-from mortarbench.harness.plugin import Family, Solver, as_family
+from mortarbench.harness.keys import classes_of, keys_of
+from mortarbench.harness.plugin import Family, Solver
 
 if TYPE_CHECKING:
     from mortarbench.harness.operators import Maker
@@ -59,7 +57,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _SOLVER_PARTS = ("declines", "prepare")
-_FAMILY_PARTS = ("name", "defaults", "forms", "build")
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
 #: Names of modules that a plug-in does not import from its folder, even if they exist
 #: there.
@@ -441,7 +438,7 @@ def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
 
     current : default of the option, whose type is required if there is no annotation
     """
-    kinds = _classes(annotation)
+    kinds = classes_of(annotation)
     if kinds is None:
         kinds = None if current is None else (type(current),)
     if kinds is None or (value is None and current is None):
@@ -462,22 +459,6 @@ def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
     )
     got = type(value).__name__
     raise InputError(f"{where} = {value!r} is of type {got}; expected {expected}")
-
-
-def _classes(annotation: Any) -> tuple[type, ...] | None:
-    """Return the classes that an annotation allows, or None for any class."""
-    if annotation is None:
-        return None
-    if get_origin(annotation) is Literal:
-        return tuple(dict.fromkeys(type(value) for value in get_args(annotation)))
-    if get_origin(annotation) in (Union, UnionType):
-        parts = [_classes(part) for part in get_args(annotation)]
-        if any(part is None for part in parts):
-            return None
-        return tuple(dict.fromkeys(kind for part in parts for kind in part or ()))
-    kind = get_origin(annotation) or annotation
-    is_class = isinstance(kind, type) and not getattr(kind, "_is_protocol", False)
-    return (kind,) if is_class else None
 
 
 def _no_file(plugin_file: PluginFile) -> InputError:
@@ -677,41 +658,53 @@ def _imported_names(file: Path) -> set[str]:
 
 
 def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
-    """Check the types and names of the objects of a plug-in; return a `Plugin`.
+    """Check the types of the objects of a plug-in; return a `Plugin`.
 
     where : file or "entry points", for messages
     """
-    for name, offered, kind, parts in (
-        ("SOLVERS", solvers, "solver", _SOLVER_PARTS),
-        ("PROBLEMS", problems, "family", _FAMILY_PARTS),
-    ):
+    for name, offered in ("SOLVERS", solvers), ("PROBLEMS", problems):
         if not isinstance(offered, Mapping):
             raise InputError(
                 f"{where}: {name} is of type {_type(offered)}; expected dict"
             )
         for key, thing in offered.items():
-            at = f"{where}: {name}[{key!r}]"
-            if isinstance(thing, type):
-                raise InputError(f"{at} is a class; expected an instance")
-            if not isinstance(key, str) or not _has(parts, thing):
-                raise InputError(
-                    f"{at} is of type {_type(thing)}; expected a {kind} with "
-                    f"{', '.join(parts)}, keyed by a string"
-                )
-    for key, family in problems.items():
-        if family.name != key:
+            with located(f"{where}: {name}[{key!r}]"):
+                if isinstance(thing, type):
+                    raise InputError("a class; expected an instance")
+                if not isinstance(key, str):
+                    raise InputError("the key is not a string; expected a name")
+                if name == "PROBLEMS":
+                    _check_family(thing)
+                elif not is_solver(thing):
+                    raise InputError(
+                        f"of type {_type(thing)}; expected a solver with the "
+                        f"methods {' and '.join(_SOLVER_PARTS)}"
+                    )
+    return Plugin(solvers=dict(solvers), problems=dict(problems), origin=where)
+
+
+def _check_family(family: Any) -> None:
+    """Raise InputError unless an object is a family with keys, defaults and forms."""
+    if not isinstance(family, Family) or not is_dataclass(family):
+        raise InputError(
+            f"of type {_type(family)}; expected a frozen dataclass that inherits "
+            "from mortarbench.Family"
+        )
+    forms = getattr(family, "forms", None)
+    if not isinstance(forms, tuple) or not forms or {type(f) for f in forms} != {str}:
+        raise InputError(f"forms = {shown(forms)}; expected a tuple of strings")
+    keys = keys_of(type(family))
+    for name, value in family.params.items():
+        if keys[name].default not in (None, value):
             raise InputError(
-                f"{where}: PROBLEMS[{key!r}] is named {family.name!r}; expected equal "
-                "names"
+                f"{name} = {value!r}; expected the default of the class, "
+                f"{keys[name].default!r}, since case names omit it"
             )
-        _check_names(f"{where}: PROBLEMS[{key!r}]", family)
-    families = {name: as_family(offered) for name, offered in problems.items()}
-    return Plugin(solvers=dict(solvers), problems=families, origin=where)
 
 
 def is_solver(thing: object) -> bool:
     """Return True if `thing`, an object or a class, has the methods of a solver."""
-    return _has(_SOLVER_PARTS, thing)
+    return all(hasattr(thing, part) for part in _SOLVER_PARTS)
 
 
 def check_solver(thing: object) -> None:
@@ -724,46 +717,16 @@ def check_solver(thing: object) -> None:
 
     """
     methods = " and ".join(_SOLVER_PARTS)
-    if isinstance(thing, type) and _has(_SOLVER_PARTS, thing):
+    if isinstance(thing, type) and is_solver(thing):
         raise InputError(
             f"solver = {thing.__name__} is a class; expected an instance, such as "
             f"{thing.__name__}()"
         )
-    if not isinstance(thing, str) and not _has(_SOLVER_PARTS, thing):
+    if not isinstance(thing, str) and not is_solver(thing):
         raise InputError(
             f"solver = {shown(thing)}; expected the name of a solver, or an object "
             f"with the methods {methods}"
         )
-
-
-def _has(parts: Sequence[str], thing: object) -> bool:
-    return all(hasattr(thing, part) for part in parts)
-
-
-def _check_names(where: str, family: Any) -> None:
-    """Check the types of the keys, defaults and forms of a family.
-
-    Raises
-    ------
-    InputError
-        If `defaults` or `forms` has the wrong type, or `forms` is empty.
-
-    """
-    defaults, forms = family.defaults, family.forms
-    if not isinstance(defaults, Mapping) or not all(
-        isinstance(key, str) and type(value) in (int, float, str)
-        for key, value in defaults.items()
-    ):
-        raise InputError(
-            f"{where}: defaults = {defaults!r}; "
-            "expected a dict from strings to integers, floats or strings"
-        )
-    if (
-        not isinstance(forms, tuple | list)
-        or not forms
-        or not all(isinstance(form, str) and form for form in forms)
-    ):
-        raise InputError(f"{where}: forms = {forms!r}; expected a tuple of strings")
 
 
 def _import_error(where: str, e: BaseException) -> InputError:

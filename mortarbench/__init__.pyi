@@ -3,6 +3,8 @@ from .answer import solve as solve
 from .case import build as build
 from .case import export as export
 from .harness.errors import InputError as InputError
+from .harness.keys import DERIVED as DERIVED
+from .harness.keys import Range as Range
 from .harness.plugin import Case as Case
 from .harness.plugin import Family as Family
 from .harness.qp import QP as QP

@@ -238,7 +238,8 @@ class Answer:
         states, last = [], int(self.case.params.get("step", 1))
         for step in range(1, last):
             params = {**self.case.params, "step": step}
-            case_id = assemble(self.case.id.family, params, self.case.form)
+            name, family = self.case.id.family_name, self.case.id.family
+            case_id = assemble(name, family, params, self.case.form)
             earlier = solve(
                 Case(id=case_id, registries=self.case.registries),
                 self.solver,
@@ -326,7 +327,7 @@ def solve(
     spec = SolverSpec(name=name, label=name, options=requested).on(ranks)
     parts = ranks
     if ranks > 1:
-        parts = problem.id.family.subdomains(problem.form, problem.params)
+        parts = problem.id.family.subdomains(problem.form)
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
     with ExitStack() as stack:

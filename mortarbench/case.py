@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from mortarbench.harness import checked, plugin
 from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.keys import Value
 from mortarbench.harness.names import CaseId, parse, unbuilt
 from mortarbench.registries import (
     TURN,
@@ -43,7 +44,7 @@ class Case(plugin.Case):
             If the case cannot be built.
 
         """
-        origin = self.registries.origins.get(self.id.family.name)
+        origin = self.registries.origins.get(self.id.family_name)
         try:
             with one_thread():
                 return self.id.build(self.registries.reference)
@@ -100,7 +101,7 @@ class Case(plugin.Case):
         return self.family_case.recover(solution)
 
     @property
-    def params(self) -> Mapping[str, plugin.Value]:
+    def params(self) -> Mapping[str, Value]:
         """Values of all keys of the family, including defaults."""
         return self.id.params
 
@@ -151,7 +152,7 @@ class Case(plugin.Case):
         meta = plain(
             {
                 "name": self.name,
-                "family": self.id.family.name,
+                "family": self.id.family_name,
                 "params": self.params,
                 "form": self.form,
                 "units": "non-dimensional; energy in SI = scale * objective + constant",
@@ -187,22 +188,15 @@ class Case(plugin.Case):
         return f"<Case {self.name}: {sizes}>"
 
 
+@dataclass(frozen=True)
 class BareQP(plugin.Family):
     """Family of a single problem: a QP that was passed as an object."""
 
-    name = "qp"
-    defaults: Mapping[str, plugin.Value] = MappingProxyType({})
-    forms = ("qp",)
+    forms: ClassVar = ("qp",)
 
-    def __init__(self, qp: QP) -> None:
-        self.qp = qp
+    qp: Any = field(compare=False)  #: a `QP`; its import loads numpy
 
-    def build(
-        self,
-        form: str,
-        params: Mapping[str, plugin.Value],
-        reference: plugin.Reference,
-    ) -> plugin.Case:
+    def build(self, form: str, reference: plugin.Reference) -> plugin.Case:
         """Return the QP as a case without physical results."""
         return plugin.Case(qp=self.qp, recover=lambda s: s.x, quantities=lambda _: {})
 
@@ -242,7 +236,7 @@ def as_case(
     from mortarbench.harness import QP
 
     if isinstance(problem, QP):
-        name = CaseId(family=BareQP(problem), name="qp", params={}, form="qp")
+        name = CaseId(family=BareQP(problem), name="qp", form="qp")
         return Case(id=name, registries=load_registries(plugins))
     # attributes are tested, since an import of qpsolvers takes a second
     if hasattr(problem, "get_problem_data"):

@@ -11,7 +11,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mortarbench.harness.names import completed
 from mortarbench.harness.plugin import About, Solver
 from mortarbench.harness.registry import options_of
 from mortarbench.registries import Plugins, Registries, load_registries
@@ -110,7 +109,7 @@ def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> 
         {
             "name": name,
             "description": first_sentence(family),
-            "defaults": completed(family, {}),
+            "defaults": family.params,
             "forms": family.forms,
         }
         for name, family in registries.families.items()

@@ -10,6 +10,7 @@ from typing import Any
 from mortarbench.harness.distributed.comm import Comm
 from mortarbench.harness.distributed.mpi import too_few_parts
 from mortarbench.harness.errors import InputError
+from mortarbench.harness.names import assemble
 from mortarbench.harness.plugin import CaseOnRanks
 from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.ranks import launch
@@ -42,8 +43,11 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     def build(case: Mapping[str, Any], comm: Comm) -> CaseOnRanks:
         from mortarbench.solvers.reference.operators import reference_of_operator
 
-        family = registries.families[case["family"]]
-        on_ranks = family.on_ranks(case["form"], case["params"])
+        name = case["family"]
+        case_id = assemble(
+            name, registries.families[name], case["params"], case["form"]
+        )
+        on_ranks = case_id.family.on_ranks(case_id.form)
         if on_ranks is None:
             raise InputError(too_few_parts(1, comm.size))
         return on_ranks(comm, reference_of_operator)

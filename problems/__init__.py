@@ -21,18 +21,20 @@ PROBLEMS: Registry[Family] = Registry(
             "mortarbench.problems.families.hertz_sphere", "HertzSphere"
         ),
         "cube-wall": entry("mortarbench.problems.families.cube_wall", "CubeWall"),
-        "half-space": entry("mortarbench.problems.families.half_space", "HalfSpace"),
+        "half-space": entry(
+            "mortarbench.problems.families.half_space.cases", "HalfSpace"
+        ),
         "greco": entry("mortarbench.problems.families.greco", "Greco"),
         "cantilever": entry("mortarbench.problems.families.cantilever", "Cantilever"),
-        "obstacle": entry("mortarbench.problems.families.obstacle", "Obstacle"),
-        "membranes": entry("mortarbench.problems.families.membranes", "Membranes"),
+        "obstacle": entry("mortarbench.problems.families.feti_models", "Obstacle"),
+        "membranes": entry("mortarbench.problems.families.feti_models", "Membranes"),
         "string": entry("mortarbench.problems.families.variational", "String"),
         "journal-bearing": entry(
             "mortarbench.problems.families.variational", "JournalBearing"
         ),
         "torsion": entry("mortarbench.problems.families.variational", "Torsion"),
-        "plate": entry("mortarbench.problems.families.plate", "Plate"),
-        "bodies": entry("mortarbench.problems.families.gmsh_bodies", "GmshBodies"),
+        "plate": entry("mortarbench.problems.families.feti_models", "Plate"),
+        "bodies": entry("mortarbench.problems.families.bodies", "MeshedBodies"),
         "file": entry("mortarbench.problems.families.from_file", "FromFile"),
         "fclib": entry("mortarbench.problems.families.fclib", "Fclib"),
     }
@@ -46,7 +48,8 @@ OPERATORS: Registry[Maker] = Registry(
             "mortarbench.problems.feti.operator_arrays", "dual_operator_from_arrays"
         ),
         "half-space": entry(
-            "mortarbench.problems.models.half_space.influence", "influence_from_arrays"
+            "mortarbench.problems.families.half_space.influence",
+            "influence_from_arrays",
         ),
     }
 )

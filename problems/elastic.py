@@ -59,16 +59,8 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.fem.mesh_files.named import NamedMesh
 from mortarbench.problems.fem.mesh_files.reading import read_msh
-from mortarbench.problems.ranges import (
-    GLUES,
-    LAW_PARAMETERS,
-    LAWS,
-    at_least,
-    at_most,
-    one_of,
-    physical,
-    positive,
-)
+from mortarbench.problems.feti.subdomains import GLUE
+from mortarbench.problems.keys import LAW_PARAMETERS, LAWS, physical
 
 __all__ = [
     "Bodies",
@@ -78,16 +70,12 @@ __all__ = [
     "Mesh",
     "NamedMesh",
     "assemble",
-    "at_least",
-    "at_most",
     "dofs_of",
     "half_disc",
     "half_ring",
     "join",
     "nodal_lengths",
-    "one_of",
     "one_step",
-    "positive",
     "prefixed",
     "read_msh",
     "rectangle",
@@ -132,7 +120,8 @@ def one_step(
     """
     if form not in FORMS:
         raise InputError(f"form {form!r}; expected {' or '.join(map(repr, FORMS))}")
-    GLUES["glue"].check("one_step", "glue", {"glue": glue})
+    if glue not in GLUE:
+        raise InputError(f"glue {glue!r}; expected {' or '.join(map(repr, GLUE))}")
     if parts and form != "dual":
         raise InputError(
             f"parts with form {form} is not built; expected form dual, or parts=0"
@@ -145,7 +134,7 @@ def one_step(
     check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
     problem = ContactProblem(
         bodies=elastic,
-        linearise=keyed_linearisation({"contact": contact, "basis": basis}),
+        linearise=keyed_linearisation(contact, basis),
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, laws),
         # the first friction bound of Coulomb's law must be large enough for friction to
         # support bodies that nothing else supports

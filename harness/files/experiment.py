@@ -21,7 +21,8 @@ from mortarbench.harness.files.csvfile import csv_text
 from mortarbench.harness.files.durable import replace_file
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.files.store import load_fields, save_fields
-from mortarbench.harness.plugin import Fields, Value
+from mortarbench.harness.keys import Value
+from mortarbench.harness.plugin import Fields
 
 Row = Mapping[str, Value]
 

@@ -36,7 +36,7 @@ from mortarbench.harness.files.store import (
     read_point,
     write_arrays,
 )
-from mortarbench.harness.names import CaseId, unbuilt
+from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
@@ -70,12 +70,15 @@ class Cases:
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request; the reply reports failures of the family's code."""
         fields = request.get("build") or request["describe"]
-        name = CaseId(**{**fields, "family": self.families[fields["family"]]})
+        family = fields["family"]
         try:
+            name = assemble(
+                family, self.families[family], fields["params"], fields["form"]
+            )
             case = self._case(name, request["keep"])
         except (Exception, SystemExit) as e:  # raised by code of the family
             return {
-                "unbuilt": unbuilt(name, e),
+                "unbuilt": unbuilt(fields["name"], e),
                 "trace": traceback.format_exc(),
                 "past_end": isinstance(e, PastEndError),
             }

@@ -47,7 +47,8 @@ def case_of(record: Record, families: Mapping[str, Family]) -> CaseId:
     """Return the case of a record; raise `InputError` if its family is unknown."""
     if record.family not in families:
         raise InputError(f"unknown family {record.family!r}")
-    return assemble(families[record.family], record.params, record.form)
+    family = families[record.family]
+    return assemble(record.family, family, record.params, record.form)
 
 
 def plugins_needed(environment: Mapping[str, Any]) -> str:

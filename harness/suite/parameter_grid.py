@@ -83,7 +83,7 @@ def expand_problems(
                     f"the grid spans {count} cases; expected at most {most} in all; "
                     f"take fewer values, or set max_cases = {count} in the suite"
                 )
-            every, along = _grid(axes, family, forms)
+            every, along = _grid(axes, problem.family, family, forms)
             if steps is None:
                 cold.update((case.name, case) for case in every)
             for (axis, *_), cases in along.items():
@@ -100,7 +100,10 @@ def expand_problems(
 
 
 def _grid(
-    axes: Sequence[Sequence[Mapping[str, Any]]], family: Family, forms: Sequence[str]
+    axes: Sequence[Sequence[Mapping[str, Any]]],
+    name: str,
+    family: Family,
+    forms: Sequence[str],
 ) -> tuple[list[CaseId], dict[tuple[Any, ...], list[CaseId]]]:
     """Return the cases of a grid, and the cases along each axis.
 
@@ -113,7 +116,7 @@ def _grid(
         rows = (axis[i] for axis, i in zip(axes, index, strict=True))
         point = {key: value for row in rows for key, value in row.items()}
         for form in forms:
-            cases.append(assemble(family, point, form))
+            cases.append(assemble(name, family, point, form))
             for axis in range(len(axes)):
                 others = (*index[:axis], *index[axis + 1 :])
                 along.setdefault((axis, form, others), []).append(cases[-1])
@@ -123,8 +126,8 @@ def _grid(
 def _params(problem: Problem, folder: Path, family: Family) -> dict[str, Any]:
     """Return the keys that an entry sets, with the files that its paths denote."""
     for key in problem.params:
-        if key not in family.defaults:
-            raise unknown("key", key, family.defaults, where=problem.family)
+        if key not in family.params:
+            raise unknown("key", key, family.params, where=problem.family)
     if family.path_suffix is None or "path" not in problem.params:
         return problem.params
     path = _expanded(problem.params["path"], folder, family)

@@ -68,7 +68,7 @@ def new_record(
     return Record(
         run_id=hex_digest([text.encode()]),
         case=case.name,
-        family=case.family.name,
+        family=case.family_name,
         params=case.params,
         form=case.form,
         sizes={},

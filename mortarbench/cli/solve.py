@@ -121,5 +121,6 @@ def _hint(answer: Answer) -> str:
 
     if not case.qp.h.size and not any(isinstance(s, Cones) for s in case.qp.sets):
         return ""
-    dual = assemble(case.id.family, case.params, "dual").name
+    name, family = case.id.family_name, case.id.family
+    dual = assemble(name, family, case.params, "dual").name
     return f"; dualise inequality rows first: solve {dual}"

@@ -11,63 +11,40 @@ units; the energy in these units is scale · objective + constant.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from scipy.sparse import diags_array
 
-from mortarbench.harness import (
-    QP,
-    Case,
-    Family,
-    InputError,
-    Reference,
-    Solution,
-    Value,
-    no_rows,
-)
+from mortarbench import QP, Case, Family, InputError, Range, Solution
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Problem(Family):
     """String on (0, 1) under a unit load, above a flat obstacle: u ≥ −depth."""
 
-    name: str = "NAME"
-    #: keys with their default values, in the order in which case names contain them
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: {"n": 50, "depth": 0.05}, hash=False
-    )
-    forms: tuple[str, ...] = ("primal",)
+    forms: ClassVar = ("primal",)
 
-    def check(self, params: Mapping[str, Value]) -> None:
-        """Raise an `InputError` with a one-line message if a value is out of range."""
-        n, depth = int(params["n"]), float(params["depth"])
-        if n < 2:
-            raise InputError(f"NAME: n = {n}; expected at least 2")
-        if not depth > 0:
-            raise InputError(f"NAME: depth = {depth}; expected a positive number")
+    # keys with type, range, help text and default, in the order of case names
+    n: Annotated[int, Range(2), "interior nodes"] = 50
+    depth: Annotated[float, Range(0, 1e9), "distance of the obstacle"] = 0.05
 
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
+    def __post_init__(self) -> None:
+        """Raise an `InputError` with a one-line message if values do not fit."""
+        super().__post_init__()  # checks every range
+        if self.depth == 0:
+            raise InputError("depth=0; expected a positive number")
+
+    def build(self, form: str, reference: object) -> Case:
         """Build one case, with linear finite elements and n interior nodes."""
-        n, depth = int(params["n"]), float(params["depth"])
+        n = self.n
         h = 1 / (n + 1)
         K = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)) / h
-        qp = QP(
-            P=K.tocsc(),
-            q=np.full(n, h),
-            A=no_rows(n),
-            b=np.zeros(0),
-            G=no_rows(n),
-            h=np.zeros(0),
-            lb=np.full(n, -depth),
-            ub=np.full(n, np.inf),
-        )
+        qp = QP.from_arrays(K.tocsc(), np.full(n, h), lb=np.full(n, -self.depth))
 
         def quantities(s: Solution) -> Mapping[str, Any]:
-            touching = np.count_nonzero(s.x <= -depth * (1 - 1e-6))
+            touching = np.count_nonzero(s.x <= -self.depth * (1 - 1e-6))
             return {"lowest": float(s.x.min()), "touching": int(touching)}
 
         return Case(qp=qp, recover=lambda s: s.x, quantities=quantities)

@@ -18,14 +18,13 @@ for small mu.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from mortarbench.harness import Friction, InputError, Vector
-from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.problems.contact.bodies import UnassembledBodies
 from mortarbench.problems.contact.rows import ContactRows
@@ -59,16 +58,15 @@ class FrictionLaw:
         return self.kind != "none"
 
 
-def law_of(params: Mapping[str, Any]) -> FrictionLaw:
-    """Return the law from the keys `friction`, `bound` and `mu`.
+def law_of(friction: str, bound: float, mu: float) -> FrictionLaw:
+    """Return the law from the values of the keys of the same names.
 
-    The values must have been validated.
+    The values must have been validated; parameters of other laws are ignored.
     """
-    kind = str(params["friction"])
     return FrictionLaw(
-        kind,
-        bound=float(params["bound"]) if kind == "tresca" else 0.0,
-        mu=float(params["mu"]) if kind == "coulomb" else 0.0,
+        friction,
+        bound=bound if friction == "tresca" else 0.0,
+        mu=mu if friction == "coulomb" else 0.0,
     )
 
 
@@ -153,21 +151,3 @@ def coulomb_fixed_point(
         f"Tresca problems, ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
         f"{min(residuals):.1e} at best; expected a smaller mu, or friction=tresca"
     )
-
-
-def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
-    """Select a fixed-point iterate of a load step: 1, 2, …; 0 selects the last.
-
-    Raises
-    ------
-    PastEndError
-        If the load step has fewer iterates.
-
-    """
-    if iterate > len(problems):
-        raise PastEndError(
-            f"iterate={iterate}: the fixed-point iteration of step {step} has only "
-            f"{len(problems)} iterates; expected at most {len(problems)}, or 0 for the "
-            "last"
-        )
-    return problems[iterate - 1]

@@ -26,7 +26,6 @@ from mortarbench.harness import Friction, Solution, Vector
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
     coulomb_fixed_point,
-    select_iterate,
 )
 from mortarbench.problems.fem.mesh import Nodes
 
@@ -164,8 +163,8 @@ class LoadPath(Generic[P]):
     ArithmeticError
         If a reference solution is not accurate enough.
     InputError
-        If the fixed-point iteration for Coulomb's law does not converge, has fewer
-        iterates than requested, or reaches bounds for which no equilibrium exists.
+        If the fixed-point iteration for Coulomb's law does not converge, or reaches
+        bounds for which no equilibrium exists.
 
     """
 
@@ -176,12 +175,9 @@ class LoadPath(Generic[P]):
         default_factory=list, init=False
     )
 
-    def problem(self, step: int, iterate: int = 0) -> Iterate[P]:
-        """Return an iterate of the last linearisation of a load step (1, 2, …).
-
-        iterate : number of the iterate for Coulomb's law, 1, 2, …; 0 selects the last
-        """
-        return select_iterate(self.problems(self.last_of(step)), iterate, step)
+    def problem(self, step: int) -> Iterate[P]:
+        """Return the last iterate at the end of a load step (1, 2, …)."""
+        return self.problems(self.last_of(step))[-1]
 
     def iterates(self, step: int) -> int:
         """Return the number of iterates of a load step; 1 without Coulomb's law."""

@@ -57,7 +57,7 @@ def case_of(
     """
     elastic = problem.bodies
     path, torn = monolithic_path(problem, reference), None
-    chosen = path.problem(choice.step, choice.iterate)
+    chosen = path.problem(choice.step)
     whole, friction, _ = chosen
     primal, count = whole.primal, path.iterates(choice.step)
     if choice.size:

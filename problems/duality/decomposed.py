@@ -175,8 +175,7 @@ def case_on_ranks(
     ------
     InputError
         If there are fewer subdomains than ranks, or if the fixed-point iteration for
-        Coulomb's law does not converge or takes fewer iterates than the number that
-        `choice` selects.
+        Coulomb's law does not converge.
 
     """
     if problem.bodies.lift is not None:
@@ -185,7 +184,7 @@ def case_on_ranks(
             "or supports without displacement"
         )
     path = decomposed_path(problem, choice, comm, reference)
-    chosen = path.problem(choice.step, choice.iterate)
+    chosen = path.problem(choice.step)
     others = path.before(choice.step, chosen)
     count = path.iterates(choice.step)
     torn = chosen.problem.served.torn.with_bound(chosen.friction.bound)

@@ -44,21 +44,21 @@ from mortarbench.problems.fem.stress import recover, von_mises_of
 def newton_path(
     bodies: Bodies,
     linearise: Linearise,
-    params: Mapping[str, Any],
     reference: Reference,
+    *,
+    material: str,
+    contact: str = "",
+    stiffness: str = "none",
     steps: int = 1,
 ) -> NewtonPath:
-    """Return the load path of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
+    """Return the load path of hyperelastic bodies; see `problems.keys`.
 
-    linearise : function that linearises contact by the method that `params` select
-    params : keys of the case; `material` is required, `contact` and
-        `contact_stiffness` are optional
+    linearise : function that linearises contact by the method `contact`
     """
     gaps = Gaps(linearise)
-    if params.get("contact") == "nts":
-        stiffness = params.get("contact_stiffness", "none")
+    if contact == "nts":
         gaps = _node_to_segment(bodies, linearise, stiffness)
-    cells = cells_without_units(bodies, params["material"])
+    cells = cells_without_units(bodies, material)
     return NewtonPath(bodies, cells, gaps, reference, steps)
 
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, wraps
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Friction, InputError, Solution, Value, Vector
+from mortarbench.harness import QP, Friction, Solution, Vector
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -313,57 +313,12 @@ class Choice(NamedTuple):
     """Selection of one QP of a contact problem."""
 
     step: int = 1  #: number of the load step, from 1
-    #: number of the fixed-point iterate for Coulomb's law, from 1; 0 for the last one
-    iterate: int = 0
     size: int = 0  #: argument of `Shape.layout`; 0 for undivided bodies
     glue: str = "orthonormal"  #: one of `problems.feti.subdomains.GLUE`
 
 
-#: keys of a case that select one of the QPs of a problem
-CHOICES = ("step", "iterate", "feti", "parts", "glue")
-
-
-def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
-    """Return the selection of a QP from the keys of a case.
-
-    Raises
-    ------
-    InputError
-        If subdomains are requested in a form other than the dual.
-
-    """
-    p: Any = params
-    key = "parts" if "parts" in p else "feti"
-    size = p.get(key, 0)
-    if size and form != "dual":
-        raise InputError(
-            f"{key} with form {form} is not built; expected form dual, or no {key}"
-        )
-    return Choice(
-        p.get("step", 1),
-        p.get("iterate", 0),
-        size,
-        p.get("glue", "orthonormal"),
-    )
-
-
-def cached_problem(
-    state: Callable[[Mapping[str, Any]], ContactProblem],
-) -> Callable[[Mapping[str, Value]], ContactProblem]:
-    """Cache the last four problems of `state`; the keys `CHOICES` are ignored."""
-    cached = lru_cache(maxsize=4)(lambda items: state(dict(items)))
-
-    @wraps(state)
-    def problem(params: Mapping[str, Value]) -> ContactProblem:
-        return cached(tuple((k, v) for k, v in params.items() if k not in CHOICES))
-
-    return problem
-
-
 def keyed_linearisation(
-    params: Mapping[str, Any],
+    contact: str, basis: str
 ) -> Callable[[UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise]:
     """Return the linearisation that the keys `contact` and `basis` select."""
-    return lambda bodies, laws: linearisation(
-        bodies, params["contact"], params["basis"], laws
-    )
+    return lambda bodies, laws: linearisation(bodies, contact, basis, laws)

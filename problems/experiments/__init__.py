@@ -18,7 +18,7 @@ from mortarbench.problems.experiments.parts import (
 )
 from mortarbench.problems.experiments.physics import pressures, stepping, verification
 from mortarbench.problems.experiments.plan import PAPER, QUICK, Plan
-from mortarbench.problems.models.beam_ring import BEAM, LOAD, RING
+from mortarbench.problems.families.beam_ring import BEAM, LOAD, RING
 
 __all__ = ["PAPER", "QUICK", "Plan", "paper_experiment"]
 

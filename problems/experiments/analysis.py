@@ -24,7 +24,7 @@ from mortarbench.problems.duality.monolithic import load_path, recovered
 from mortarbench.problems.experiments.clock import Laps, Stopwatch, race
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
-from mortarbench.problems.models.beam_ring import bodies as bodies_of
+from mortarbench.problems.families.beam_ring import bodies as bodies_of
 
 #: mapping from the name of a variant to True if the variant condenses K⁺ onto the
 #: interface

@@ -14,6 +14,7 @@ from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.experiments.clock import Laps, Stopwatch, race, timed_as_one
 from mortarbench.problems.experiments.plan import Plan
+from mortarbench.problems.families.beam_ring import BEAM, LENGTH, LOAD, model
 from mortarbench.problems.fem.elasticity import (
     elasticity_matrix,
     rigid_modes,
@@ -24,7 +25,6 @@ from mortarbench.problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
 from mortarbench.problems.fem.inverse import floating_inverse
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, rectangle
 from mortarbench.problems.fem.triplets import stiffness_by_triplets
-from mortarbench.problems.models.beam_ring import BEAM, LENGTH, LOAD, model
 
 Rows = Iterator[dict[str, Value]]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mortarbench.harness import Case, Reference, Value
+from mortarbench.harness import Reference
 from mortarbench.harness.plugin import Family
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
@@ -21,7 +21,7 @@ from mortarbench.problems.fem.mesh import nodal_lengths
 CONVERGED = (2, 8)
 
 #: mapping from the name of a contact method in figures to the keys of its case
-ROWS: Mapping[str, Mapping[str, Value]] = {
+ROWS: Mapping[str, Mapping[str, Any]] = {
     "nts": {"contact": "nts"},
     "mortar": {"contact": "mortar", "basis": "dual"},
     "mortar-standard": {"contact": "mortar", "basis": "standard"},
@@ -40,8 +40,8 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
     Nr, Nh = plan.stepped
     variants = [(s, r) for r in plan.relin for s in plan.stepping]
     for steps, relin in (*variants, CONVERGED):
-        keys = {"Nr": Nr, "Nh": Nh, "steps": steps, "step": steps, "relin": relin}
-        values = _quantities(BeamRing(), keys, solve, "dual-bounds")
+        family = BeamRing(Nr=Nr, Nh=Nh, steps=steps, relin=relin)
+        values = _quantities(family, solve, "dual-bounds")
         yield {
             "steps": steps,
             "relin": relin,
@@ -60,11 +60,11 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
     ds over the arc, the force is the magnitude ‖(Bᵀλ)_j‖ of the contact force on the
     node, and the pressure is force per length.
     """
-    keys = {"Nr": plan.scaling[-1], "Nh": plan.Nh, "steps": plan.steps}
+    family = BeamRing(Nr=plan.scaling[-1], Nh=plan.Nh, steps=plan.steps)
     for contact in ("nts", "mortar"):
         for step in range(1, plan.steps + 1):
-            more = {"step": step, "contact": contact}
-            case = _case(BeamRing(), {**keys, **more}, solve, "dual-bounds")
+            keys = {**family.params, "step": step, "contact": contact}
+            case = family.with_keys(**keys).build("dual-bounds", solve)
             assert case.fields is not None
             fields = case.fields(solve(case.qp))
             (side,) = fields.contacts
@@ -94,23 +94,17 @@ def verification(plan: Plan, solve: Reference) -> Rows:
     """
     for contact, keys in ROWS.items():
         for upper in plan.patch:
-            params = {"upper": upper, "lower": upper + upper // 2, **keys}
-            error = _quantities(ContactPatch(), params, solve)["stress_error"]
+            blocks = ContactPatch(upper=upper, lower=upper + upper // 2, **keys)
+            error = _quantities(blocks, solve)["stress_error"]
             yield {"problem": "patch", "contact": contact, "n": upper, "error": error}
         for n in plan.hertz:
-            params = {"n": n, "m": max(3 * n // 4, 1), **keys}
-            error = _quantities(HertzCylinder(), params, solve)["pressure_l2_error"]
+            cylinders = HertzCylinder(n=n, m=max(3 * n // 4, 1), **keys)
+            error = _quantities(cylinders, solve)["pressure_l2_error"]
             yield {"problem": "hertz", "contact": contact, "n": n, "error": error}
 
 
 def _quantities(
-    family: Family, keys: Mapping[str, Value], solve: Reference, form: str = "dual"
+    family: Family, solve: Reference, form: str = "dual"
 ) -> Mapping[str, Any]:
-    case = _case(family, keys, solve, form)
+    case = family.build(form, solve)
     return case.quantities(solve(case.qp))
-
-
-def _case(
-    family: Family, keys: Mapping[str, Value], solve: Reference, form: str
-) -> Case:
-    return family.build(form, family.complete(keys), solve)

@@ -1,32 +1,85 @@
-"""Family `cube-wall`, a cube beside a wall; see `problems.models.solids.cube_wall`."""
+"""A cube of hexahedra next to a rigid wall: PERMON's example of contact in 3D.
+
+The unit cube with E = 2e4 Pa and ν = 0.33 is clamped on z = 0 and loaded by a pressure
+of 465 Pa on its top. The cube bulges towards the wall, which enforces u_x ≤ 1 mm on
+x = 1. Contact rows are simple bounds and require no linearisation. Clamped nodes have
+no contact row.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
-from mortarbench.problems.families.declared import ContactFamily
-from mortarbench.problems.ranges import (
-    CONTACT_FORMS,
-    DECOMPOSITION,
-    check_memory,
-    key,
-    schema,
+import numpy as np
+
+from mortarbench.harness.keys import Range
+from mortarbench.problems.contact.bodies import ContactPair
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.rigid import RigidPlane
+from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.duality.problem import (
+    ContactProblem,
+    ContactSolution,
+    ElasticBodies,
+    StructuredSolids,
 )
+from mortarbench.problems.families.contact import ContactFamily
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import box, dofs_of, nodal_areas
+from mortarbench.problems.keys import CONTACT_FORMS, Feti, Glue, check_memory
 
-if TYPE_CHECKING:
-    from mortarbench.harness import Value
+MATERIAL = Material(E=2e4, nu=0.33)
+SIDE = 1.0  #: side length of the cube, m
+PRESSURE = 465.0  #: pressure on the top, Pa
+GAP = 1e-3  #: gap between cube and wall, m
+FORCE = PRESSURE * SIDE**2  #: unit of force F₀, N
+WALL = RigidPlane((SIDE + GAP, 0.0, 0.0), (-1.0, 0.0, 0.0))
 
 
+@dataclass(frozen=True, kw_only=True)
 class CubeWall(ContactFamily):
     """A three-dimensional elastic cube, pressed down next to a rigid wall (PERMON)."""
 
-    name = "cube-wall"
-    keys = schema(n=key(8, 1), **DECOMPOSITION)
-    forms = CONTACT_FORMS
-    problem = "solids.cube_wall.problem"
+    forms: ClassVar = CONTACT_FORMS
 
-    def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range."""
-        super().check(params)
-        check_memory(self.name, 3 * int(params["n"]) ** 3)
+    n: Annotated[int, Range(1), "cells along each edge"] = 8
+    feti: Feti = 0
+    glue: Glue = "orthonormal"
+
+    def __post_init__(self) -> None:
+        """Check that the cube fits into memory."""
+        super().__post_init__()
+        check_memory(3 * self.n**3)
+
+    def problem(self) -> ContactProblem:
+        """Return the contact problem of the cube with n × n × n cells."""
+        divisions = self.n, self.n, self.n
+        mesh = box((0.0, 0.0, 0.0), (SIDE, SIDE, SIDE), divisions)
+        shape = StructuredSolids((mesh,), (divisions,))
+        top, areas = nodal_areas(mesh.points, shape.sides["top"])
+        forces = Forces(dofs_of(top, 3, 2), -PRESSURE * areas / FORCE)
+        right, bottom = shape.sides["right"], np.unique(shape.sides["bottom"])
+        fixed = dofs_of(bottom, 3)
+        corner = dofs_of(np.array([len(mesh.points) - 1]), 3)
+
+        def results(solution: ContactSolution) -> dict[str, Any]:
+            """Return the displacement of the corner (1, 1, 1), m."""
+            return {"corner": (solution.at(corner) * SIDE).tolist()}
+
+        return ContactProblem(
+            bodies=ElasticBodies(
+                shape=shape,
+                names=("cube",),
+                materials=(MATERIAL,),
+                plane=None,
+                length=SIDE,
+                force=FORCE,
+                fixed=fixed,
+                forces=forces,
+                pairs=(ContactPair(right, right[:0], WALL),),
+            ),
+            stages=load_steps(1, 1, forces, fixed),
+            linearise=lambda bodies, _: linearisation(bodies, "nts", "dual"),
+            results=results,
+        )

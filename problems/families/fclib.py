@@ -2,66 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
 
-from mortarbench.harness.errors import unknown
+import numpy as np
+
+from mortarbench.harness import Case, Reference, Solution
+from mortarbench.harness.checked import located
+from mortarbench.harness.keys import DERIVED
 from mortarbench.problems.families.from_file import FromFile
-from mortarbench.problems.ranges import at_least
-
-if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Solution, Value
+from mortarbench.problems.files.fclib import read_fclib
+from mortarbench.problems.files.friction_cones import coulomb_steps, states
 
 
+@dataclass(frozen=True, kw_only=True)
 class Fclib(FromFile):
     """Contacts with Coulomb friction from FCLIB files, ``fclib:PATH.hdf5``.
 
     Coulomb's law is solved by a sequence of convex problems, with fixed cones or fixed
     discs according to the key `loop`. The QP is the last one, whose solution satisfies
-    Coulomb's law, or problem number `iterate` if `iterate` is not 0. The digest of the
-    file is a parameter of the case.
+    Coulomb's law. The digest of the file is a key of the case.
     """
 
-    name = "fclib"
-    path_suffix = ".hdf5"
-    defaults: Mapping[str, Value] = MappingProxyType(
-        {"path": "", "loop": "cones", "iterate": 0, "sha256": ""}
-    )
-    forms = ("dual",)
+    forms: ClassVar = ("dual",)
+    path_suffix: ClassVar = ".hdf5"
 
-    def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the keys are in range and the file exists."""
-        loops = ("cones", "tresca")
-        if params["loop"] not in loops:
-            raise unknown("loop", str(params["loop"]), loops, where=self.name)
-        at_least(0, self.name, params, ["iterate"])
-        super().check(params)
+    path: Annotated[str, "path of the file"] = ""
+    loop: Annotated[
+        Literal["cones", "tresca"], "convex problems with fixed cones or fixed discs"
+    ] = "cones"
+    sha256: Annotated[str, "digest of the file"] = DERIVED
 
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Return the case of one convex problem, scaled by max W_ii and max |q_i|.
+    def build(self, form: str, reference: Reference) -> Case:
+        """Return the case of the last convex problem, scaled by max W_ii and max |q_i|.
 
         Raises
         ------
         InputError
             If the file is damaged, its problem is not convex, or the sequence of convex
             problems does not converge.
-        PastEndError
-            If the sequence has fewer problems than `iterate`.
 
         """
-        import numpy as np
-
-        from mortarbench.harness import Case
-        from mortarbench.harness.checked import located
-        from mortarbench.harness.errors import PastEndError
-        from mortarbench.problems.files.fclib import read_fclib
-        from mortarbench.problems.files.friction_cones import coulomb_steps, states
-
-        p: Any = params
-        path = self._located(params)
+        path = self.located()
         file = read_fclib(path)
         speed = float(np.abs(file.contact.q).max(initial=0.0)) or 1.0
         largest = float(file.contact.W.diagonal().max(initial=0.0)) or 1.0
@@ -69,12 +51,7 @@ class Fclib(FromFile):
         contact = file.contact.scaled(force, speed)
         with located(str(path)):
             contact.check_convex()
-            steps = coulomb_steps(contact, p["loop"], reference, p["iterate"])
-        if p["iterate"] > len(steps):
-            raise PastEndError(
-                f"iterate={p['iterate']}: loop={p['loop']} has only {len(steps)} "
-                f"iterates; expected at most {len(steps)}, or 0 for the last"
-            )
+            steps = coulomb_steps(contact, self.loop, reference)
         remarks = []
         if (rank := contact.rank) is not None and rank < contact.q.size:
             remarks.append(

@@ -1,53 +1,217 @@
-"""Family `greco`: a plate with friction; see `problems.models.greco`."""
+"""GRECO's plate with Coulomb friction on a rigid plane (Code_Aster's SSNV128).
+
+A square with sides of 40 mm in plane strain lies on the rigid plane y = 0 with friction
+(μ = 1). Pressures act on the top and left sides, and the right side is supported in x:
+
+    σ_y = −5e7 Pa at y = 40 mm,  σ_x = −15e7 Pa at x = 0,  u_x = 0 at x = 40 mm
+
+with u_y = 0 at the corner (40 mm, 0), which has no contact row. The left end of the
+contact side lifts off, the middle slips and the right end sticks. The published results
+are the tangential displacements of five points of the contact side, ±5 %, and the
+normal force at x = 38.75 mm for 32 cells per side (GRECO working group on friction; see
+document V6.04.128 of Code_Aster).
+
+In 3D (dim=3) the square is extruded along z into layers of cubes. The end faces have
+u_z = 0; the solution in every layer of nodes is therefore that of plane strain.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, NamedTuple
 
-from mortarbench.harness import InputError
-from mortarbench.problems.families.declared import ContactFamily
-from mortarbench.problems.ranges import (
+import numpy as np
+
+from mortarbench.harness import QP, Friction, Solution, Vector
+from mortarbench.harness.keys import Range
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    UnassembledBodies,
+)
+from mortarbench.problems.contact.friction import FrictionLaw
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.rigid import RigidPlane
+from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.duality.problem import (
+    ContactProblem,
+    ElasticBodies,
+    StructuredGrids,
+    StructuredSolids,
+)
+from mortarbench.problems.families.contact import ContactFamily
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import (
+    Nodes,
+    box,
+    dofs_of,
+    nodal_areas,
+    nodal_lengths,
+    rectangle_grid,
+)
+from mortarbench.problems.keys import (
     CONTACT_FORMS,
-    DECOMPOSITION,
-    DIMENSION,
     MAX_SIZE,
+    Dimension,
+    Feti,
+    Glue,
     check_memory,
-    key,
-    schema,
+    refuse_unused,
 )
 
-if TYPE_CHECKING:
-    from mortarbench.harness import Value
+SIDE = 0.04  #: side length of the square, m
+MATERIAL = Material(E=1.3e11, nu=0.2)
+TOP, LEFT = 5e7, 15e7  #: pressures on the sides, Pa
+FORCE = TOP * SIDE  #: unit of force F₀, N/m
+#: positions x of the published points, m
+PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])
+#: published u_x at PLACES, m
+PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])
+FORCE_AT = 38.75e-3  #: position x of the published normal force, m
 
 
+@dataclass(frozen=True, kw_only=True)
 class Greco(ContactFamily):
     """GRECO's plate, pushed along a rigid plane with Coulomb friction (SSNV128)."""
 
-    name = "greco"
-    keys = schema(
-        n=key(32, 2),
-        mu=key(1.0),
-        iterate=key(0, 0),
-        **DECOMPOSITION,
-        **DIMENSION,
-        depth=key(1, 1),
-    )
-    forms = CONTACT_FORMS
-    problem = "greco.problem"
+    forms: ClassVar = CONTACT_FORMS
 
-    def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range and mu is not negative."""
-        super().check(params)
-        dim, n, depth = (int(params[key]) for key in ("dim", "n", "depth"))
-        if dim == 2 and depth != self.defaults["depth"]:
-            raise InputError(
-                f"{self.name}: depth={depth} is not used by dim=2; expected no depth, "
-                "or dim=3"
-            )
-        check_memory(self.name, n**2 if dim == 2 else 3 * n**2 * depth)
-        if not 0 <= float(params["mu"]) <= MAX_SIZE:
-            raise InputError(
-                f"{self.name}: mu={params['mu']}; expected a coefficient of friction "
-                "of 0 or more"
-            )
+    n: Annotated[int, Range(2), "cells along each side"] = 32
+    mu: Annotated[float, Range(0, MAX_SIZE), "coefficient of friction"] = 1.0
+    feti: Feti = 0
+    glue: Glue = "orthonormal"
+    dim: Dimension = 2
+    depth: Annotated[int, Range(1), "layers of cubes in 3D"] = 1
+
+    def __post_init__(self) -> None:
+        """Check the size and the dimension."""
+        super().__post_init__()
+        if self.dim == 2:
+            refuse_unused(self, "depth", "dim=2", "dim=3")
+        check_memory(self.n**2 if self.dim == 2 else 3 * self.n**2 * self.depth)
+
+    def problem(self) -> ContactProblem:
+        """Return the problem of the plate with n × n cells, or n × n × depth in 3D."""
+        dim, n = self.dim, self.n
+        body = plate(n) if dim == 2 else extruded_plate(n, self.depth)
+        unit = FORCE * body.thickness
+        (top, top_shares), (left, left_shares) = body.top, body.left
+        forces = Forces(
+            np.concatenate([dofs_of(top, dim, 1), dofs_of(left, dim, 0)]),
+            np.concatenate([-TOP * top_shares / unit, LEFT * left_shares / unit]),
+        )
+        fixed = np.concatenate(
+            [
+                dofs_of(body.right, dim, 0),
+                dofs_of(body.corner, dim, 1),
+                dofs_of(body.ends, dim, dim - 1),
+            ]
+        )
+        rigid = RigidPlane((0.0,) * dim, (0.0, 1.0, 0.0)[:dim])
+        on_rigid = ContactPair(body.ground, body.ground[:0], rigid)
+        return ContactProblem(
+            bodies=ElasticBodies(
+                shape=body.shape,
+                names=("plate",),
+                materials=(MATERIAL,),
+                plane="strain" if dim == 2 else None,
+                length=SIDE,
+                force=unit,
+                fixed=fixed,
+                forces=forces,
+                pairs=(on_rigid,),
+            ),
+            stages=load_steps(
+                1, 1, forces, fixed, (FrictionLaw("coulomb", mu=self.mu),)
+            ),
+            linearise=lambda bodies, laws: linearisation(bodies, "nts", "dual", laws),
+            results=lambda answer: {
+                **published_quantities(*answer.sides, thickness=body.thickness),
+                "tresca_problems": answer.problems,
+            },
+        )
+
+
+class Plate(NamedTuple):
+    """Plate with the nodes of its sides, and nodal lengths (areas) of loaded sides."""
+
+    shape: StructuredGrids | StructuredSolids
+    ground: Nodes  #: contact side y = 0, in 2D without its node on x = 40 mm
+    top: tuple[Nodes, Vector]  #: nodes of y = 40 mm and nodal lengths, m (areas, m²)
+    left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths, m (areas, m²)
+    right: Nodes  #: nodes of x = 40 mm
+    corner: Nodes  #: nodes of x = 40 mm, y = 0
+    ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in 2D
+    thickness: float  #: thickness, m; 1 in 2D
+
+
+def plate(n: int) -> Plate:
+    """Return the plate with n × n quadrilaterals."""
+    grid = rectangle_grid((0.0, 0.0), (SIDE, SIDE), (n, n))
+    sides = grid.sides
+    top, left = (
+        (sides[name], nodal_lengths(grid.position(sides[name])))
+        for name in ("top", "left")
+    )
+    corner = sides["bottom"][-1:]
+    return Plate(
+        shape=StructuredGrids((grid,)),
+        ground=sides["bottom"][:-1],
+        top=top,
+        left=left,
+        right=sides["right"],
+        corner=corner,
+        ends=np.zeros(0, dtype=np.int64),
+        thickness=1.0,
+    )
+
+
+def extruded_plate(n: int, depth: int) -> Plate:
+    """Return the plate with n × n × depth cubes between its end faces."""
+    thickness, divisions = SIDE * depth / n, (n, n, depth)
+    mesh = box((0.0, 0.0, 0.0), (SIDE, SIDE, thickness), divisions)
+    sides = mesh.boundaries
+    ground, right = sides["front"], np.unique(sides["right"])
+    top, left = (nodal_areas(mesh.points, sides[name]) for name in ("back", "left"))
+    return Plate(
+        shape=StructuredSolids((mesh,), (divisions,)),
+        ground=ground,
+        top=top,
+        left=left,
+        right=right,
+        corner=np.intersect1d(ground, right),
+        ends=np.unique(np.concatenate([sides["bottom"], sides["top"]])),
+        thickness=thickness,
+    )
+
+
+def published_quantities(
+    bodies: UnassembledBodies,
+    primal: QP,
+    s: Solution,
+    rows: ContactRows,
+    friction: Friction,
+    thickness: float,
+) -> dict[str, Any]:
+    """Return the published quantities, interpolated linearly between nodes.
+
+    In 3D, displacements are means over z, and forces are sums over z divided by the
+    thickness. The keys are `displacement`, u_x at `PLACES` in m; `published_error`, the
+    largest relative deviation from the published values; `normal_force`, the nodal
+    force at 38.75 mm in N/m; and `tangential_sum`, the magnitude of the total friction
+    force in N/m.
+    """
+    dim, (pair,) = bodies.mesh.dim, bodies.pairs
+    nodes = pair.slave_nodes[rows.place]  # nodes with contact rows
+    x, column = np.unique(bodies.mesh.points[nodes, 0], return_inverse=True)
+    u = s.x[dofs_of(nodes, dim, 0)] * bodies.length
+    normal = np.bincount(column, s.z[: primal.h.size]) * bodies.force / thickness
+    mean = np.bincount(column, u) / np.bincount(column)
+    at_places: Vector = np.interp(PLACES, x, mean)
+    force = friction.T.T @ s.z[primal.h.size :] * bodies.force / thickness
+    return {
+        "displacement": at_places.tolist(),
+        "published_error": float(np.abs(at_places / PUBLISHED - 1).max()),
+        "normal_force": float(np.interp(FORCE_AT, x, normal)),
+        "tangential_sum": float(abs(force[dofs_of(nodes, dim, 0)].sum())),
+    }

@@ -1,111 +1,627 @@
-"""Families of Hertzian line contact; see `problems.models.hertz`."""
+"""Line contact of cylinders, with Hertz's exact solution (Johnson 1985, Section 4.2).
+
+With 1/R = 1/R₁ + 1/R₂, 1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ) and the force P per
+thickness, two elastic bodies with radii of curvature R₁ and R₂ touch over |x| ≤ a
+with the pressure
+
+    p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
+
+Bodies are half discs. A uniform pressure acts on the flat side of the upper body, and
+with a tangential force also on that of the lower body. The force is prescribed, since
+the theory does not determine the approach. Contact alone supports the upper body
+vertically; therefore, the form ``dual-bounds`` does not exist.
+
+The keys `n` and `m`, numbers of cells per half width a, refine the contact zone only.
+Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. The key
+`halvings` is the number of bisections of all cells along both directions.
+
+R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark in the literature, which states no
+units. Here the units are mm, GPa and MN/m, so that a = 0.68078 mm and p₀ = 9.3514 GPa.
+
+A tangential force Q on two cylinders of the same material acts on the flat sides. The
+loads are shear tractions with resultants ±Q, and normal tractions, linear along each
+side, that balance the moment without supports. Loads and deformations of the two bodies
+are symmetric: contact and friction alone support the upper body, and the supports of
+the lower body have no reactions. Exact tractions are those of
+`problems.families.line_contact`. The key `programme` is
+
+* normal-first: P without friction, then the peak of Q, then the reduced Q, in one stage
+  each;
+* proportional: P and Q grow together in steps k = 1, 2, … with friction, with P ∝ k² so
+  that a grows by equal increments. If slip is measured from the end of the preceding
+  step (quasi-static), the shear traction is (Q/P)p and nothing slips. For a single
+  static load, the tractions are as if Q had been applied last.
+
+Two errors do not vanish as the mesh is refined, because the bodies are finite (0.1 %)
+and a/R is not zero. Contact of two cylinders is linearised at the undeformed state,
+along normals that differ from the vertical by up to a/R. The deviation from Hertz's
+solution is of order a²/R² ∝ P, and 1 % at P = 10; the default load of two cylinders is
+therefore smaller.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
-from mortarbench.harness import InputError
-from mortarbench.problems.families.declared import ContactFamily
-from mortarbench.problems.ranges import (
-    DECOMPOSITION,
-    FRICTION,
-    HALVINGS,
-    KINEMATICS,
-    METHODS,
-    PLANES,
-    STEPS,
+import numpy as np
+from numpy.typing import NDArray
+
+from mortarbench.harness import (
+    QP,
+    Case,
+    Friction,
+    InputError,
+    Reference,
+    Solution,
+    Vector,
+)
+from mortarbench.harness.keys import DERIVED, Range
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    ContactSides,
+    UnassembledBodies,
+)
+from mortarbench.problems.contact.friction import FrictionLaw, law_of
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import contact_forces
+from mortarbench.problems.contact.rigid import RigidPlane
+from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
+from mortarbench.problems.duality.case_forms import with_exact_tractions
+from mortarbench.problems.duality.newton import Iteration, NewtonPath
+from mortarbench.problems.duality.newton_case import newton_path
+from mortarbench.problems.duality.problem import (
+    ContactProblem,
+    ContactSolution,
+    ElasticBodies,
+    HalfDiscs,
+    Linearise,
+)
+from mortarbench.problems.families.contact import ContactFamily
+from mortarbench.problems.families.line_contact import LineContact, TangentialContact
+from mortarbench.problems.fem.elasticity import Material, Plane
+from mortarbench.problems.fem.mesh import (
+    HalfDisc,
+    Nodes,
+    as_vectors,
+    dofs_of,
+    joined_sides,
+    nodal_lengths,
+)
+from mortarbench.problems.keys import (
+    POSITIVE,
+    UNSET,
+    Basis,
+    Bound,
+    Feti,
+    Glue,
+    Halvings,
+    Kinematics,
+    Law,
+    Loading,
+    MaterialLaw,
+    Method,
+    Mu,
+    Newton,
+    PlaneState,
+    Steps,
     check_memory,
     check_tangential,
-    choice,
-    key,
-    positive,
-    schema,
-    size,
+    refuse_unused,
 )
 
-if TYPE_CHECKING:
-    from mortarbench.harness import Value
+RADIUS = 8e-3  #: radius R of a cylinder, m
+NAMES = ("upper", "lower")
+MATERIAL = Material(E=200e9, nu=0.3)
+UNIT_LOAD = 1e6  #: unit of the key `load`, N/m
+GROUND = RigidPlane((0.0, 0.0), (0.0, 1.0))
+
+GROWTH = 1.15  #: ratio of the sizes of neighbouring cells away from the contact
+#: half width of the uniformly meshed part of the arc, in units of a
+UNIFORM_HALF_WIDTH = 1.5
+CURVE_POINTS = 601  #: number of points on the uniform part for plots of exact tractions
 
 
+@dataclass(frozen=True, kw_only=True)
 class HertzPlane(ContactFamily):
     """Hertz contact: an elastic half cylinder pressed onto a rigid plane."""
 
-    name = "hertz-plane"
-    keys = schema(
-        n=key(10, 1),
-        load=size(10.0),
-        **PLANES,
-        halvings=HALVINGS,
-        **DECOMPOSITION,
-        **KINEMATICS,
-    )
-    forms = ("primal", "dual")
-    problem = "hertz.plane_problem"
-    model = "hertz.newton_step"
+    forms: ClassVar = ("primal", "dual")
 
-    def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range."""
-        super().check(params)
-        check_memory(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
+    n: Annotated[int, Range(1), "cells per half width of the contact"] = 10
+    load: Annotated[float, POSITIVE, "force P, MN/m"] = 10.0
+    plane: PlaneState = "strain"
+    halvings: Halvings = 0
+    feti: Feti = 0
+    glue: Glue = "orthonormal"
+    kinematics: Kinematics = "linear"
+    material: MaterialLaw = "neo-hooke"
+    newton: Newton = 0
+
+    def __post_init__(self) -> None:
+        """Check that the mesh fits into memory."""
+        super().__post_init__()
+        check_memory((self.n * 2**self.halvings) ** 2)
+
+    def problem(self) -> ContactProblem:
+        """Return the linear problem of a cylinder on a rigid plane."""
+        elastic, exact = _cylinder_on_plane(self)
+
+        def results(answer: ContactSolution) -> dict[str, Any]:
+            bodies, primal, s, _, _ = answer.sides
+            return pressure_quantities(bodies, primal, exact, s)
+
+        return ContactProblem(
+            bodies=elastic,
+            stages=load_steps(1, 1, elastic.forces, elastic.fixed),
+            linearise=lambda bodies, _: linearisation(bodies, "nts", "dual"),
+            results=results,
+            exact=_curve(exact),
+        )
+
+    def newton_path(self, reference: Reference) -> NewtonPath:
+        """Return the Newton iterations; gaps to a plane are linear in u."""
+        bodies = _cylinder_on_plane(self)[0].assembled
+        rows = linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
+        return newton_path(bodies, lambda u: rows, reference, material=self.material)
+
+    def newton_results(
+        self, path: NewtonPath, at: Iteration, s: Solution
+    ) -> dict[str, Any]:
+        """Compare the pressure with Hertz's."""
+        exact = _cylinder_on_plane(self)[1]
+        return pressure_quantities(at.tangent, at.primal, exact, s)
+
+    def newton_case(self, form: str, reference: Reference) -> Case:
+        """Return the case of a Newton iteration, with the exact tractions."""
+        case = super().newton_case(form, reference)
+        return with_exact_tractions(case, _curve(_cylinder_on_plane(self)[1]))
 
 
+@dataclass(frozen=True, kw_only=True)
 class HertzCylinder(ContactFamily):
     """Hertz contact: an elastic half cylinder pressed onto another half cylinder."""
 
-    name = "hertz-cylinder"
-    keys = schema(
-        n=key(10, 1),
-        m=key(8, 1),
-        load=size(1.0),
-        ratio=size(1.0),
-        slave=choice("lower", "upper").with_default("upper"),
-        contact=METHODS["contact"].with_default("mortar"),
-        basis=METHODS["basis"],
-        **PLANES,
-        halvings=HALVINGS,
-        **FRICTION,
-        Q=key(0.0),
-        peak=key(0.0),
-        programme=choice("normal-first", "proportional"),
-        steps=STEPS.with_default(20),
-        **DECOMPOSITION,
+    forms: ClassVar = ("primal", "dual")
+
+    n: Annotated[int, Range(1), "cells of the upper cylinder per half width"] = 10
+    m: Annotated[int, Range(1), "cells of the lower cylinder per half width"] = 8
+    load: Annotated[float, POSITIVE, "force P, MN/m"] = 1.0
+    ratio: Annotated[float, POSITIVE, "ratio of the moduli, lower to upper"] = 1.0
+    slave: Annotated[Literal["lower", "upper"], "cylinder with the slave side"] = (
+        "upper"
     )
-    forms = ("primal", "dual")
-    problem = "hertz.problem"
+    contact: Method = "mortar"
+    basis: Basis = "dual"
+    plane: PlaneState = "strain"
+    halvings: Halvings = 0
+    friction: Law = "none"
+    bound: Bound = UNSET
+    mu: Mu = UNSET
+    loading: Loading = "quasi-static"
+    Q: Annotated[float, "tangential force, a fraction of μP"] = 0.0
+    peak: Annotated[float, "force before unloading, a fraction of μP; default: Q"] = (
+        DERIVED
+    )
+    programme: Annotated[
+        Literal["normal-first", "proportional"], "P before Q, or both together"
+    ] = "normal-first"
+    steps: Steps = 20
+    feti: Feti = 0
+    glue: Glue = "orthonormal"
 
-    def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys; `peak` defaults to `Q`, which means no unloading."""
-        return {**self.defaults, "peak": given.get("Q", 0.0), **given}
-
-    def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range and has an effect."""
-        super().check(params)
-        check_memory(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
-        has_shear = bool(params["Q"] or params["peak"])
-        proportional = params["programme"] == "proportional"
+    def __post_init__(self) -> None:
+        """Derive `peak`; check that every key has an effect."""
+        self.derive(peak=self.Q)
+        super().__post_init__()
+        check_memory((self.n * 2**self.halvings) ** 2)
+        has_shear = bool(self.Q or self.peak)
+        proportional = self.programme == "proportional"
         if has_shear:
             for name, value in (("friction", "coulomb"), ("ratio", 1.0)):
-                if params[name] != value:
+                if getattr(self, name) != value:
                     raise InputError(
-                        f"{self.name}: {name}={params[name]} is not supported with a "
+                        f"{name}={getattr(self, name)} is not supported with a "
                         f"tangential force; expected {name}={value}, or no Q and "
                         "no peak"
                     )
-            check_tangential(self.name, params)
-            positive(self.name, params, ("mu",))
-        if params["loading"] == "static" and params["Q"] != params["peak"]:
+            check_tangential(self)
+            if self.mu not in POSITIVE:
+                raise InputError(f"mu={self.mu} must be {POSITIVE}")
+        if self.loading == "static" and self.Q != self.peak:
             raise InputError(
-                f"{self.name}: peak={params['peak']} is not used by loading=static; "
-                "expected loading=quasi-static, which unloads"
+                f"peak={self.peak} is not used by loading=static; expected "
+                "loading=quasi-static, which unloads"
             )
-        if proportional and not (has_shear and params["Q"] == params["peak"]):
+        if proportional and not (has_shear and self.Q == self.peak):
             raise InputError(
-                f"{self.name}: programme=proportional requires Q > 0 and peak=Q "
-                "(the default), that is, no unloading"
+                "programme=proportional requires Q > 0 and peak=Q (the default), that "
+                "is, no unloading"
             )
-        if params["steps"] != self.defaults["steps"] and not proportional:
-            raise InputError(
-                f"{self.name}: steps={params['steps']} is not used by "
-                f"programme={params['programme']}; expected programme=proportional"
-            )
+        if not proportional:
+            programme = f"programme={self.programme}"
+            refuse_unused(self, "steps", programme, "programme=proportional")
+
+    def problem(self) -> ContactProblem:
+        """Return the problem of two cylinders, linearised at the undeformed state."""
+        elastic, exact = two_cylinders(self)
+        laws, shear = (
+            (law_of(self.friction, self.bound, self.mu),),
+            _exact_shear(exact, self) if self.peak else None,
+        )
+
+        def linearise(
+            bodies: UnassembledBodies | ContactSides, laws: Sequence[FrictionLaw]
+        ) -> Linearise:
+            rows = linearisation(bodies, self.contact, self.basis, laws)
+            return lambda u: rows(np.zeros_like(u))
+
+        def results(answer: ContactSolution) -> dict[str, Any]:
+            bodies, primal, s, _, friction = answer.sides
+            values = pressure_quantities(bodies, primal, exact, s)
+            if shear is not None:
+                values |= shear_quantities(
+                    bodies, primal, exact, s, friction, self, shear
+                )
+            if self.friction == "coulomb":
+                values["tresca_problems"] = answer.problems
+            return values
+
+        stages = load_steps(1, 1, elastic.forces, elastic.fixed, laws)
+        has_exact = self.friction == "none" or shear is not None
+        return ContactProblem(
+            bodies=elastic,
+            linearise=linearise,
+            results=results,
+            stages=stages if shear is None else _programme(self, elastic),
+            exact=_curve(exact, shear or np.zeros_like) if has_exact else None,
+        )
+
+
+def _cylinder_on_plane(
+    keys: HertzPlane,
+) -> tuple[ElasticBodies, LineContact]:
+    """Return the cylinder on a rigid plane with n cells per a, and Hertz's solution."""
+    exact = LineContact(
+        keys.load * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, keys.plane)
+    )
+    a = min(exact.a, RADIUS)  # see `half_cylinders`
+    shape = HalfDiscs((_half_cylinder(RADIUS, a / keys.n, a, keys.halvings),))
+    sides = shape.sides
+    return ElasticBodies(
+        shape=shape,
+        names=("cylinder",),
+        materials=(MATERIAL,),
+        plane=keys.plane,
+        length=RADIUS,
+        force=exact.P,
+        fixed=_on_axis(sides),
+        forces=_pressing(shape.parts, "flat", 1.0),
+        pairs=(ContactPair(sides["arc"], sides["arc"][:0], GROUND),),
+    ), exact
+
+
+class HalfCylinders(NamedTuple):
+    """Two half cylinders that touch at (0, 0), and Hertz's solution."""
+
+    discs: tuple[HalfDisc, ...]
+    materials: tuple[Material, ...]
+    exact: LineContact
+
+
+def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]:
+    """Return the stages of a tangential load: P without friction, then P and Q.
+
+    In the first stage, supports on the axis fix the upper cylinder horizontally; under
+    P they have no reactions. Without these supports and without friction, the cylinders
+    could roll on each other almost freely, because only the polygonal shape of the arcs
+    would resist. Slip in the next stage would then be measured from an arbitrary state,
+    and the rolling would contribute to the work of Q.
+    """
+    discs, sides = half_cylinders(keys).discs, elastic.shape.sides
+    pressing = [
+        _pressing(discs, "upper_flat", 1.0),
+        _pressing(discs, "lower_flat", -1.0),
+    ]
+    loads = _loads(keys)
+    quasi_static = keys.loading == "quasi-static"
+
+    def acting(P: float, Q: float) -> Forces:
+        forces = [Forces(at, P * value) for at, value in pressing]
+        return _summed(forces + (_shearing(discs, Q * keys.mu) if Q else []))
+
+    def begin(k: int, end: State) -> State:
+        """Return the initial state of a stage, with normal forces in proportion to P.
+
+        k : number of the stage with friction, from 0
+        end : state at the end of the preceding stage
+        """
+        previous = loads[max(k - 1, 0)][0]
+        at_rest = not k and _slip_starts_at_rest(keys)
+        u = np.zeros_like(end.u) if at_rest else end.u
+        slip = u if quasi_static else np.zeros_like(u)
+        return State(u, slip, loads[k][0] / previous * end.normal_forces)
+
+    fixed = np.append(elastic.fixed, _on_axis(sides, "upper_"))
+    first = Stage(step=1, part=1.0, forces=acting(loads[0][0], 0.0), fixed=fixed)
+    return first, *(
+        Stage(
+            step=1,
+            part=1.0,
+            forces=acting(P, Q),
+            fixed=elastic.fixed,
+            laws=(law_of(keys.friction, keys.bound, keys.mu),),
+            begin=partial(begin, k),
+        )
+        for k, (P, Q) in enumerate(loads)
+    )
+
+
+def half_cylinders(keys: HertzCylinder) -> HalfCylinders:
+    """Return the cylinders, with n (upper) and m (lower) cells per half width a.
+
+    Both cylinders have R = 8 mm. The upper one has E = 200 GPa; the modulus of the
+    lower one is multiplied by `ratio`. If Hertz's a exceeds R, because the bodies are
+    too soft for the theory, the mesh is that for a = R, so that the uniform part of the
+    arc does not exceed the half disc.
+    """
+    lower_material = Material(keys.ratio * MATERIAL.E, MATERIAL.nu)
+    compliance = _compliance(MATERIAL, keys.plane)
+    compliance += _compliance(lower_material, keys.plane)
+    exact = LineContact(keys.load * UNIT_LOAD, RADIUS / 2, 1 / compliance)
+    a, halvings = min(exact.a, RADIUS), keys.halvings
+    upper = _half_cylinder(RADIUS, a / keys.n, a, halvings).prefixed("upper_")
+    lower = _half_cylinder(-RADIUS, a / keys.m, a, halvings).prefixed("lower_")
+    return HalfCylinders((upper, lower), (MATERIAL, lower_material), exact)
+
+
+def two_cylinders(keys: HertzCylinder) -> tuple[ElasticBodies, LineContact]:
+    """Return the cylinders in contact under P alone, and Hertz's solution.
+
+    With a tangential force, the supports only exclude rigid motions and have no
+    reactions. Without a tangential force, the supports also enforce the symmetry about
+    the axis.
+    """
+    halves = half_cylinders(keys)
+    discs, exact, shape = halves.discs, halves.exact, HalfDiscs(halves.discs)
+    sides, flat = shape.sides, shape.sides["lower_flat"]
+    forces = [_pressing(discs, "upper_flat", 1.0)]
+    on_axis = _on_axis(sides, "lower_")
+    if keys.peak:
+        forces.append(_pressing(discs, "lower_flat", -1.0))
+        fixed = np.append(on_axis, dofs_of(flat[flat.size // 2], 2, 1))
+    else:
+        upper = _on_axis(sides, "upper_")
+        fixed = np.concatenate([upper, on_axis, dofs_of(flat, 2, 1)])
+    return ElasticBodies(
+        shape=shape,
+        names=NAMES,
+        materials=halves.materials,
+        plane=keys.plane,
+        length=RADIUS,
+        force=exact.P,
+        fixed=fixed,
+        forces=_summed(forces),
+        pairs=(_pair(keys, sides),),
+    ), exact
+
+
+def _pair(keys: HertzCylinder, sides: Mapping[str, Nodes]) -> ContactPair:
+    upper, lower = sides["upper_arc"], sides["lower_arc"]
+    return ContactPair(*((upper, lower) if keys.slave == "upper" else (lower, upper)))
+
+
+def _shear_forces(points: NDArray[np.float64], Q: float) -> Vector:
+    """Return nodal forces (2k,) of a tangential force Q on a flat side: x, y per node.
+
+    points : (k, 2) nodes of the side
+    """
+    share, (x, y) = nodal_lengths(points), points.T
+    # vertical forces ∝ x balance the moment of Q about the origin
+    forces = Q * share / share.sum(), Q * y[0] * share * x / (share @ x**2)
+    return np.column_stack(forces).ravel()
+
+
+def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[Forces]:
+    """Return the nodal forces of Q on the upper flat side, and of −Q on the lower."""
+    sides = joined_sides(discs)
+    loads = zip(discs, ("upper_flat", "lower_flat"), (Q, -Q), strict=True)
+    return [
+        Forces(
+            dofs_of(sides[flat], 2),
+            _shear_forces(disc.position(disc.sides[flat]), part),
+        )
+        for disc, flat, part in loads
+    ]
+
+
+def _summed(forces: Sequence[Forces]) -> Forces:
+    """Return the sum of forces, with each component listed once."""
+    component, value = (np.concatenate(part) for part in zip(*forces, strict=True))
+    distinct, place = np.unique(component, return_inverse=True)
+    total = np.zeros(distinct.size)
+    np.add.at(total, place, value)
+    return Forces(distinct, total)
+
+
+def _loads(keys: HertzCylinder) -> list[tuple[float, float]]:
+    """Return the forces of each step with friction, as fractions of P and of μP."""
+    if keys.loading == "static":
+        return [(1.0, keys.Q)]
+    if keys.programme == "proportional":
+        # a ∝ √P grows by equal increments
+        parts = (np.arange(1, keys.steps + 1) / keys.steps) ** 2
+        return [(part, part * keys.Q) for part in parts]
+    return [(1.0, Q) for Q in dict.fromkeys((keys.peak, keys.Q))]
+
+
+def _slip_starts_at_rest(keys: HertzCylinder) -> bool:
+    """Return True if slip is measured from rest instead of the state under P alone."""
+    return keys.loading == "static" or keys.programme == "proportional"
+
+
+def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc:
+    """Return the half disc around (0, 0) of a cylinder with centre (0, `centre`).
+
+    Cells have size h at (0, 0) and grow along the arc and inwards. All cells are then
+    bisected in both directions `halvings` times.
+    """
+    radius, towards = abs(centre), -np.copysign(np.pi / 2, centre)
+    arc = (
+        insert_midpoints(
+            graded_points(h, UNIFORM_HALF_WIDTH * a, radius * np.pi / 2), halvings
+        )
+        / radius
+    )
+    angles = towards + np.concatenate([-arc[:0:-1], arc])
+    radii = radius - insert_midpoints(graded_points(h, 0.0, radius), halvings)[:-1]
+    return HalfDisc((0.0, centre), angles, radii)
+
+
+def graded_points(h: float, uniform: float, total: float) -> Vector:
+    """Divide [0, total] into cells of size h up to `uniform`, then growing by GROWTH.
+
+    If `uniform` covers the interval, all cells have the same size, which is at most h.
+    """
+    equal = h * np.arange(np.ceil(uniform / h) + 1)
+    if equal[-1] >= total:
+        return np.linspace(0, total, int(np.ceil(total / h)) + 1)
+    rest = total - equal[-1]
+    # the smallest count with  h Σ GROWTH^k ≥ rest;  the sizes are then scaled to fit
+    count = np.ceil(np.log1p(rest * (GROWTH - 1) / (GROWTH * h)) / np.log(GROWTH))
+    sizes = GROWTH ** np.arange(1, count + 1)
+    return np.append(equal, equal[-1] + rest * np.cumsum(sizes) / sizes.sum())
+
+
+def insert_midpoints(x: Vector, times: int) -> Vector:
+    """Insert midpoints between the numbers of an increasing sequence, repeatedly.
+
+    times : number of repetitions
+    """
+    places = np.arange(x.size)
+    return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
+
+
+def _pressing(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
+    """Return the nodal forces of a load P along −y, uniform over the side `flat`."""
+    (disc,) = (disc for disc in discs if flat in disc.sides)
+    share = nodal_lengths(disc.position(disc.sides[flat]))
+    return Forces(dofs_of(joined_sides(discs)[flat], 2, 1), -P * share / share.sum())
+
+
+def pressure_quantities(
+    bodies: UnassembledBodies, primal: QP, exact: LineContact, s: Solution
+) -> dict[str, Any]:
+    """Compare the pressure on the slave side with Hertz's pressure.
+
+    The nodal pressure is the vertical contact force divided by ∫N_j dx. Errors are
+    relative. The half width is √(4∫px² dx/P), which is exact for Hertz's pressure. The
+    position of the last active node would have an error of ±h.
+    """
+    slave = bodies.pairs[0].slave
+    x = bodies.mesh.points[slave, 0]
+    width = nodal_lengths(x[:, None])
+    pressure = replace(s, z=s.z[: primal.h.size])
+    force = np.abs(contact_forces(bodies, primal, pressure)[slave, 1])
+    p, hertz = force / width, exact.pressure(x)
+    half_width = np.sqrt(4 * force @ x**2 / exact.P)
+    return {
+        "p_max": float(p.max()),
+        "p_max_error": float(p.max() / exact.p0 - 1),
+        "pressure_l2_error": float(
+            np.sqrt(width @ (p - hertz) ** 2 / (width @ hertz**2))
+        ),
+        "force_error": float(force.sum() / exact.P - 1),
+        "half_width": float(half_width),
+        "half_width_error": float(half_width / exact.a - 1),
+    }
+
+
+def shear_quantities(
+    bodies: UnassembledBodies,
+    primal: QP,
+    exact: LineContact,
+    s: Solution,
+    friction: Friction,
+    keys: HertzCylinder,
+    shear: Callable[[Vector], Vector],
+) -> dict[str, Any]:
+    """Compare the shear traction on the slave side with the exact one.
+
+    The nodal traction is the horizontal friction force divided by ∫N_j dx. Errors are
+    relative; the error of the force is relative to the peak of the force.
+    `shear_centre` is the traction at x = 0. `stick_half_width` is the half width of the
+    stick zone for which the ratio of ∫x²q to ∫x²p, with shear traction q and pressure
+    p, is the same for the exact and for the computed tractions. In this ratio, the
+    effects of the finite bodies on the two moments cancel.
+    `stick_half_width` is absent for proportional quasi-static steps, where nothing
+    slips.
+    """
+    slave, upper = bodies.pairs[0].slave, keys.slave == "upper"
+    x = bodies.mesh.points[slave, 0]
+    width = nodal_lengths(x[:, None])
+    normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
+    pressing = np.abs(as_vectors(primal.G.T @ normal, 2)[slave, 1])
+    force = as_vectors(friction.T.T @ tangential, 2)[slave, 0]
+    force = force * (1.0 if upper else -1.0)
+    mindlin = TangentialContact(exact, keys.mu, keys.Q, keys.peak)
+    Q = keys.Q * keys.mu * exact.P
+    expected, centre = shear(x), float(shear(np.zeros(1))[0])
+    q = force / width
+    at_centre = float(np.interp(0.0, np.sort(x), q[np.argsort(x)]))
+    values = {
+        "tangential_force": float(force.sum()),
+        "tangential_force_error": float(
+            (force.sum() - Q) / (keys.peak * keys.mu * exact.P)
+        ),
+        "shear_centre": at_centre,
+        "shear_centre_error": at_centre / centre - 1,
+        "shear_l2_error": float(
+            np.sqrt(width @ (q - expected) ** 2 / (width @ expected**2))
+        ),
+    }
+    if _without_slip(keys):
+        return values
+    c = mindlin.stick_half_width(float(force @ x**2), float(pressing @ x**2))
+    return values | {
+        "stick_half_width": c,
+        "stick_half_width_error": c / mindlin.c - 1,
+    }
+
+
+def _without_slip(keys: HertzCylinder) -> bool:
+    """Return True if P and Q grow in proportion, so that nothing slips."""
+    together = keys.programme == "proportional"
+    return together and keys.loading == "quasi-static"
+
+
+def _exact_shear(exact: LineContact, keys: HertzCylinder) -> Callable[[Vector], Vector]:
+    """Return the exact shear traction on the lower cylinder, Pa, for x in m."""
+    if _without_slip(keys):
+        return lambda x: exact.pressure(x) * (keys.Q * keys.mu)
+    return TangentialContact(exact, keys.mu, keys.Q, keys.peak).traction
+
+
+def _curve(
+    exact: LineContact, shear: Callable[[Vector], Vector] = np.zeros_like
+) -> NDArray[np.float64]:
+    """Return the exact tractions on the slave side, see `ContactProblem.exact`.
+
+    Shear is positive along the tangent (−n_y, n_x). On the upper cylinder, this tangent
+    is +x and the traction is −q; on the lower one, the tangent is −x and the traction
+    is q. The shear is −q in both cases.
+    """
+    x = exact.a * np.linspace(-UNIFORM_HALF_WIDTH, UNIFORM_HALF_WIDTH, CURVE_POINTS)
+    return np.column_stack([x, exact.pressure(x), -shear(x)])
+
+
+def _on_axis(sides: Mapping[str, Nodes], prefix: str = "") -> Nodes:
+    """Return the components u_x at the middle of arc and flat side; 0 by symmetry."""
+    chains = [sides[prefix + name] for name in ("arc", "flat")]
+    return dofs_of(np.array([chain[chain.size // 2] for chain in chains]), 2, 0)
+
+
+def _compliance(material: Material, plane: Plane) -> float:
+    return (1 - (material.nu**2 if plane == "strain" else 0.0)) / material.E

@@ -215,19 +215,18 @@ class ConvexStep(NamedTuple):
 
 
 def coulomb_steps(
-    contact: FrictionalContact, loop: str, solve: Callable[[QP], Solution], count: int
+    contact: FrictionalContact, loop: str, solve: Callable[[QP], Solution]
 ) -> list[ConvexStep]:
-    """Return the first convex problems of a sequence for Coulomb's law.
+    """Return the convex problems of a sequence for Coulomb's law, until convergence.
 
-    The list ends at convergence, or after `count` problems. In the loop ``tresca``, it
-    begins with the first problem over ‖r_T‖ ≤ g, after the problem over the cones.
+    In the loop ``tresca``, the list begins with the first problem over ‖r_T‖ ≤ g, after
+    the problem over the cones.
 
     Parameters
     ----------
     loop : name of the sequence, one of `LOOPS`
     solve : function that solves a convex problem and raises ArithmeticError if the
         problem has no solution
-    count : largest number of problems; 0 for no limit
 
     Raises
     ------
@@ -250,7 +249,7 @@ def coulomb_steps(
         s = method.solve(qp, r)
         errors.append(contact.natural_map(s.x, s.y))
         steps.append(ConvexStep(qp, errors[-1]))
-        if errors[-1] <= FIXED_POINT_TOLERANCE or len(steps) == count:
+        if errors[-1] <= FIXED_POINT_TOLERANCE:
             return steps
         if len(steps) - 1 - int(np.argmin(errors)) > MAX_STAGNATION:
             break

@@ -40,7 +40,7 @@ from mortarbench.harness.suite.solver_options import (
 from mortarbench.harness.suite.suite import as_toml, load_suite, read_stored
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import assemble_stiffness
-from mortarbench.problems.models.description import read_bodies
+from mortarbench.problems.families.description import read_bodies
 from mortarbench.registries import Registries
 from mortarbench.reports.data.evidence import read_evidence
 from mortarbench.reports.folder import compose, write_report

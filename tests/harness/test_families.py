@@ -1,77 +1,92 @@
-"""Families: subclasses of `Family`, and wrapped objects."""
+"""Families: keys from annotations, derived keys, messages for bad values."""
 
 from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
 
 import pytest
 
-from mortarbench.harness import Family, InputError
+from mortarbench.harness import DERIVED, Family, InputError, Range
+from mortarbench.harness.keys import keys_of
 from mortarbench.harness.names import assemble, parse
-from mortarbench.harness.plugin import as_family
-from tests.support.toy_problem import Well
 
 
-class Bare:
-    """Family with only the required attributes."""
-
-    name, defaults, forms = "bare", {"n": 1}, ("only",)
-
-    def build(self, form, params, reference):
-        return f"{form} {params}"
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Doubled(Family):
-    name: str = "doubled"
-    forms: tuple = ("only",)
-    defaults = {"n": 1, "twice": 2}  # noqa: RUF012
+    forms: ClassVar = ("only",)
 
-    def build(self, form, params, reference):
-        raise AssertionError("it is only named, never run")
+    n: Annotated[int, Range(1, 9), "some number"] = 1
+    twice: int = DERIVED
+    size: Annotated[float, Range(0)] = 1.0
+    law: Literal["soft", "hard"] = "soft"
 
-    def complete(self, given):
-        return {"n": 1, "twice": 2 * given.get("n", 1), **given}
+    def __post_init__(self):
+        self.derive(twice=2 * self.n)
+        super().__post_init__()
 
-
-def test_missing_attributes_of_a_family_have_defaults():
-    family = as_family(Bare())
-
-    assert family.complete({"n": 3}) == {"n": 3}
-    assert family.complete({}) == {"n": 1}
-    assert family.path_suffix is None
-    assert family.check({"n": -1}) is None
+    def build(self, form, reference):
+        return f"{form} {self.n}"
 
 
-def test_attributes_of_a_family_and_its_docstring_are_kept():
-    family = as_family(Well())
+def test_keys_have_the_types_ranges_and_help_texts_of_their_annotations():
+    keys = keys_of(Doubled)
 
-    assert isinstance(family, Family)
-    assert (family.name, dict(family.defaults)) == ("well", {"n": 3, "depth": 1})
-    assert (type(family).__name__, type(family).__doc__) == ("Well", Well.__doc__)
-    assert as_family(Bare()).build("only", {"n": 2}, None) == "only {'n': 2}"
-    with pytest.raises(InputError):
-        assemble(family, {"n": 0}, family.forms[0])
-
-
-def test_a_family_that_inherits_is_not_wrapped():
-    family = Doubled()
-
-    assert as_family(family) is family
-    assert as_family(as_family(Bare())).name == "bare"
+    assert list(keys) == ["n", "twice", "size", "law"]
+    assert (keys["n"].kind, keys["n"].default, str(keys["n"].range)) == (
+        int, 1, "between 1 and 9",
+    )  # fmt: skip
+    assert keys["n"].help == "some number"
+    assert keys["law"].choices == ("soft", "hard")
+    assert keys["twice"].default is None
 
 
-def test_a_case_has_its_name_parameters_and_family():
-    family = Doubled()
-    case = parse("doubled/n=3/only", {"doubled": family})
-    finer = assemble(family, {"n": 6}, case.form)
+def test_a_derived_key_follows_other_keys_even_after_it_was_set():
+    family = Doubled(n=3, twice=7)
+
+    assert Doubled(n=3).twice == 6
+    assert family.twice == 7
+    assert family.with_keys(n=4).twice == 8
+    assert family.params == {"n": 3, "twice": 7, "size": 1.0, "law": "soft"}
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"n": 0}, "n=0 must be between 1 and 9"),
+        ({"size": -1.0}, "size=-1.0 must be at least 0"),
+        ({"law": "firm"}, "law='firm' is unknown, expected 'soft' or 'hard'"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_in_one_line(keys, message):
+    with pytest.raises(InputError) as direct:
+        Doubled(**keys)
+    with pytest.raises(InputError) as named:
+        assemble("doubled", Doubled(), keys, "only")
+
+    assert str(direct.value) == message
+    assert str(named.value) == f"doubled: {message}"
+
+
+def test_ranges_hold_even_if_a_family_overrides_post_init():
+    @dataclass(frozen=True)
+    class Careless(Doubled):
+        def __post_init__(self):
+            self.derive(twice=1 // self.n)
+
+    with pytest.raises(InputError, match="careless: n=0 must be between 1 and 9"):
+        assemble("careless", Careless(), {"n": 0}, "only")
+
+
+def test_a_case_has_its_name_parameters_and_configured_family():
+    case = parse("doubled/n=3/only", {"doubled": Doubled()})
 
     assert f"{case}" == case.name == "doubled/n=3/only"
-    assert case.params == {"n": 3, "twice": 6}
-    assert case.family is family
-    assert str(finer) == "doubled/n=6/only"
+    assert case.family_name == "doubled"
+    assert case.params["twice"] == 6
+    assert case.family == Doubled(n=3)
 
 
 def test_a_family_must_build_a_case():
-    case = parse("bare/only", {"bare": as_family(Bare())})
+    case = parse("doubled/only", {"doubled": Doubled()})
 
     with pytest.raises(TypeError, match="build returned str, expected Case"):
         case.build(None)

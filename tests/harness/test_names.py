@@ -1,47 +1,49 @@
 """Case names: strict parsing, and canonical names."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import SimpleNamespace
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mortarbench.harness import InputError
+from mortarbench.harness import DERIVED, Family, InputError, Range
 from mortarbench.harness.names import CaseId, assemble, match, parse
-from mortarbench.harness.plugin import as_family
 
 
-@dataclass(frozen=True)
-class Ring:
-    """Family in which defaults derive from other keys, as in beam-ring.
-
-    The default of layers is 2·Nh, and the default of step is the value of steps.
-    """
-
-    name: str = "ring"
-    defaults: Mapping = field(
-        default_factory=lambda: {
-            "Nh": 5, "layers": 0, "steps": 10, "step": 0, "size": 1.0, "plane": "strain"
-        }
-    )  # fmt: skip
-    forms: tuple = ("primal", "dual")
-
-    def complete(self, given):
-        params = {**self.defaults, **given}
-        derived = {"layers": 2 * params["Nh"], "step": params["steps"]}
-        return params | {k: v for k, v in derived.items() if k not in given}
-
-    def check(self, params):
-        if params["Nh"] < 1:
-            raise InputError(f"ring: Nh={params['Nh']} must be at least 1")
+@dataclass(frozen=True, kw_only=True)
+class Named(Family):
+    def build(self, form, reference):
+        raise AssertionError("it is only named, never run")
 
 
-RING = as_family(Ring())
-PLAIN = as_family(
-    SimpleNamespace(name="plain", defaults={"n": 4, "kind": "soft"}, forms=("primal",))
-)
+@dataclass(frozen=True, kw_only=True)
+class Ring(Named):
+    """Family with derived keys, as in beam-ring."""
+
+    forms: ClassVar = ("primal", "dual")
+
+    Nh: Annotated[int, Range(1)] = 5
+    layers: int = DERIVED
+    steps: int = 10
+    step: int = DERIVED
+    size: float = 1.0
+    plane: str = "strain"
+
+    def __post_init__(self):
+        self.derive(layers=2 * self.Nh, step=self.steps)
+        super().__post_init__()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plain(Named):
+    forms: ClassVar = ("primal",)
+
+    n: int = 4
+    kind: str = "soft"
+
+
+RING, PLAIN = Ring(), Plain()
 FAMILIES = {"ring": RING, "plain": PLAIN}
 
 
@@ -49,9 +51,8 @@ def test_keys_left_out_take_their_defaults_in_the_family_s_order():
     name = parse("plain/kind=hard/primal", FAMILIES)
 
     assert name == CaseId(
-        family=PLAIN, name="plain/kind=hard/primal", form="primal",
-        params={"n": 4, "kind": "hard"},
-    )  # fmt: skip
+        family=Plain(kind="hard"), name="plain/kind=hard/primal", form="primal"
+    )
     assert list(name.params) == ["n", "kind"]
 
 
@@ -62,17 +63,10 @@ def test_a_derived_default_follows_the_key_that_it_derives_from():
 
 
 def test_keys_are_always_in_the_order_of_the_family():
-    odd = SimpleNamespace(
-        name="odd",
-        defaults={"a": 1, "b": 2},
-        forms=("primal",),
-        complete=lambda given: {"b": 2, "a": 1, **given},
-    )
+    name = assemble("ring", RING, {"plane": "stress", "size": 2.0, "Nh": 8}, "primal")
 
-    name = assemble(as_family(odd), {"b": 7, "a": 8}, "primal")
-
-    assert list(name.params) == ["a", "b"]
-    assert str(name) == "odd/a=8/b=7/primal"
+    assert list(name.params) == ["Nh", "layers", "steps", "step", "size", "plane"]
+    assert str(name) == "ring/Nh=8/size=2.0/plane=stress/primal"
 
 
 @pytest.mark.parametrize(
@@ -107,7 +101,7 @@ def test_a_canonical_name_lists_non_default_keys_in_the_order_of_the_family(
     form=st.sampled_from(RING.forms),
 )
 def test_a_canonical_name_parses_to_the_case_that_it_names(form, **params):
-    name = assemble(RING, params, form)
+    name = assemble("ring", RING, params, form)
 
     assert parse(str(name), FAMILIES) == name
 
@@ -175,11 +169,11 @@ def test_an_invalid_name_is_reported_in_one_line(text, message):
 )
 def test_a_typed_value_of_another_type_is_refused(key, value):
     with pytest.raises(InputError, match=f"ring: {key}={value}; expected "):
-        assemble(RING, {key: value}, "dual")
+        assemble("ring", RING, {key: value}, "dual")
 
 
 def test_an_integer_is_accepted_if_the_default_is_a_float():
-    size = assemble(RING, {"size": 2}, "dual").params["size"]
+    size = assemble("ring", RING, {"size": 2}, "dual").params["size"]
 
     assert (size, type(size)) == (2.0, float)
 
@@ -193,13 +187,18 @@ def test_patterns_are_shell_globs_over_the_whole_name_with_case():
     assert match("ring/Nh=3", names) == []
 
 
-def stored(name, suffix):
-    return as_family(
-        SimpleNamespace(
-            name=name, defaults={"path": ""}, forms=("qp",), path_suffix=suffix,
-            build=None,
-        )
-    )  # fmt: skip
+@dataclass(frozen=True, kw_only=True)
+class Stored(Named):
+    forms: ClassVar = ("qp",)
+    path_suffix: ClassVar = ""
+
+    path: str = ""
+    n: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Meshed(Stored):
+    path_suffix: ClassVar = ".toml"
 
 
 @pytest.mark.parametrize(
@@ -218,7 +217,7 @@ def test_the_error_for_a_path_names_the_case_of_the_file(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there").write_text("")
-    families = {"file": stored("file", ""), "meshed": stored("meshed", ".toml")}
+    families = {"file": Stored(), "meshed": Meshed()}
 
     with pytest.raises(InputError) as e:
         parse(text, families)
@@ -229,10 +228,9 @@ def test_the_error_for_a_path_names_the_case_of_the_file(
 @pytest.mark.parametrize("text", ["missing", "ring/n=0.5e3/dual", "a.5/dual"])
 def test_a_name_that_is_not_a_path_is_an_unknown_family(text):
     with pytest.raises(InputError, match="; known: file"):
-        parse(text, {"file": stored("file", "")})
+        parse(text, {"file": Stored()})
 
 
 @pytest.mark.parametrize("text", ["meshed:a/b.toml", "meshed:a/b.toml/qp"])
 def test_a_file_with_a_single_form_needs_no_form(text):
-    family = stored("meshed", ".toml")
-    assert str(parse(text, {"meshed": family})) == "meshed:a/b.toml/qp"
+    assert str(parse(text, {"meshed": Meshed()})) == "meshed:a/b.toml/qp"

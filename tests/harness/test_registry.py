@@ -187,10 +187,22 @@ def test_plugins_of_the_same_file_name_do_not_mix(tmp_path):
     assert type(solvers[0]).__module__ != type(solvers[1]).__module__
 
 
-FAMILY = (
-    "from types import SimpleNamespace as S\n"
-    "PROBLEMS = {{'a': S(name='a', defaults={}, forms={}, build=None)}}"
-)
+FAMILY = """
+from dataclasses import dataclass
+from mortarbench import Family
+
+@dataclass(frozen=True)
+class Mine(Family):
+    forms = {forms}
+    {key}
+    def build(self, form, reference): raise AssertionError("never run")
+
+PROBLEMS = {{"a": {made}}}
+"""
+
+
+def family(key="n: int = 1", forms="('p',)", made="Mine()"):
+    return FAMILY.format(forms=forms, key=key, made=made)
 
 
 @pytest.mark.parametrize(
@@ -205,25 +217,26 @@ FAMILY = (
         ("raise SystemExit(3)", "failed to import: SystemExit: 3"),
         ("solvers = {}", "defines neither SOLVERS nor PROBLEMS"),
         ("SOLVERS = [1]", "SOLVERS is of type list; expected dict"),
-        ("SOLVERS = {'a': 1}", "SOLVERS['a'] is of type int; expected a solver"),
-        (PLUGIN + "SOLVERS = {3: Mine()}", "SOLVERS[3] is of type Mine; expected a s"),
-        (PLUGIN + "SOLVERS = {'a': Mine}", "SOLVERS['a'] is a class; expected an inst"),
-        ("PROBLEMS = {'a': 1}", "PROBLEMS['a'] is of type int; expected a family"),
+        ("SOLVERS = {'a': 1}", "SOLVERS['a']: of type int; expected a solver"),
         (
-            "from types import SimpleNamespace as S\n"
-            "PROBLEMS = {'a': S(name='b', defaults={}, forms=(), build=None)}",
-            "PROBLEMS['a'] is named 'b'; expected equal names",
+            PLUGIN + "SOLVERS = {3: Mine()}",
+            "SOLVERS[3]: the key is not a string",
         ),
-        (FAMILY.format("['n']", "('a',)"), "PROBLEMS['a']: defaults = ['n']; expected"),
+        (PLUGIN + "SOLVERS = {'a': Mine}", "SOLVERS['a']: a class; expected an ins"),
+        ("PROBLEMS = {'a': 1}", "PROBLEMS['a']: of type int; expected a froz"),
         (
-            FAMILY.format("{'n': None}", "('a',)"),
-            "PROBLEMS['a']: defaults = {'n': None}; expected a dict from strings to i",
+            family("n: int | str = 1"),
+            "failed to import: InputError: key n is annotated",
         ),
-        (FAMILY.format("{'n': True}", "('a',)"), "PROBLEMS['a']: defaults = {'n': T"),
-        (FAMILY.format("{1: 1}", "('a',)"), "PROBLEMS['a']: defaults = {1: 1}; expe"),
-        (FAMILY.format("{}", "'dual'"), "PROBLEMS['a']: forms = 'dual'; expected a t"),
-        (FAMILY.format("{}", "()"), "PROBLEMS['a']: forms = (); expected a tuple of "),
-        (FAMILY.format("{}", "(1,)"), "PROBLEMS['a']: forms = (1,); expected a tuple"),
+        (family("n: bool = True"), "failed to import: InputError: key n is annotated"),
+        (
+            family("n: int", made="Mine(1)"),
+            "failed to import: InputError: key n has no default; ",
+        ),
+        (family(made="Mine(2)"), "PROBLEMS['a']: n = 2; expected the default of the"),
+        (family(forms="'dual'"), "PROBLEMS['a']: forms = 'dual'; expected a tuple of"),
+        (family(forms="()"), "PROBLEMS['a']: forms = (); expected a tuple of strings"),
+        (family(forms="(1,)"), "PROBLEMS['a']: forms = (1,); expected a tuple of st"),
     ],
 )
 def test_an_invalid_plugin_is_reported_in_one_line(tmp_path, text, message):
@@ -277,7 +290,7 @@ def install(tmp_path, monkeypatch):
 def test_entry_points_are_solvers_under_their_names(install, metadata):
     install(metadata, "[mortarbench.solvers]\nmine = fractions:Fraction.from_float\n")
 
-    with pytest.raises(InputError, match=r"entry points: SOLVERS\['mine'\] is of "):
+    with pytest.raises(InputError, match=r"entry points: SOLVERS\['mine'\]: of "):
         entry_point_plugins()
 
 

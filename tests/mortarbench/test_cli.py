@@ -336,8 +336,8 @@ def test_a_crashed_solver_yields_a_record(cli):
 def test_a_solver_that_ignores_interrupts_ends_with_the_command(tmp_path):
     started = tmp_path / "started"
     with subprocess.Popen(
-        [sys.executable, "-m", "harness", "solve", "well/primal", "--solver", "hangs",
-         "--plugin", TOY_PROBLEM],
+        [sys.executable, "-m", "mortarbench", "solve", "well/primal", "--solver",
+         "hangs", "--plugin", TOY_PROBLEM],
         env=os.environ | {"STARTED": str(started)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         # otherwise, background processes of a shell ignore interrupts
@@ -425,7 +425,7 @@ def test_a_closed_output_pipe_is_not_an_error():
     reading, writing = os.pipe()
     os.close(reading)
     done = subprocess.run(
-        [sys.executable, "-m", "harness", "list", "solvers"],
+        [sys.executable, "-m", "mortarbench", "list", "solvers"],
         stdout=writing, stderr=subprocess.PIPE, text=True, check=False,
     )  # fmt: skip
     os.close(writing)
@@ -435,10 +435,11 @@ def test_a_closed_output_pipe_is_not_an_error():
 
 def test_an_ascii_terminal_is_sufficient(tmp_path):
     (tmp_path / "plug.py").write_text(
-        PLUGIN.replace("class Pit:\n", 'class Pit:\n    """λ ≥ 0."""\n'), "utf-8"
+        PLUGIN.replace("Pit(Family):\n", 'Pit(Family):\n    """λ ≥ 0."""\n'), "utf-8"
     )
     done = subprocess.run(
-        [sys.executable, "-m", "harness", "list", "problems", "--plugin", "plug.py"],
+        [sys.executable, "-m", "mortarbench", "list", "problems", "--plugin",
+         "plug.py"],
         env=os.environ | {"PYTHONIOENCODING": "ascii"},
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
@@ -618,21 +619,20 @@ def test_wrong_input_is_one_line_with_the_remedy_and_exits_with_2(
 
 
 DEEPER = """
+from dataclasses import dataclass
 from pathlib import Path
+from mortarbench import Family
 from mortarbench.harness.registry import load_plugin
 
 well = load_plugin(Path({!r})).problems["well"]
 
-class Deeper:
-    name, defaults, forms = "deeper", well.defaults, well.forms
-    check, build = well.check, well.build
-
-class Nothing:
-    name, defaults, forms = "nothing", {{}}, ("primal",)
-    def build(self, form, params, reference):
+@dataclass(frozen=True)
+class Nothing(Family):
+    forms = ("primal",)
+    def build(self, form, reference):
         pass
 
-PROBLEMS = {{"deeper": Deeper(), "nothing": Nothing()}}
+PROBLEMS = {{"deeper": well, "nothing": Nothing()}}
 """
 
 
@@ -674,22 +674,20 @@ def test_every_command_and_option_has_a_help_text():
 PLUGIN = """
 from dataclasses import dataclass
 import numpy as np
-from harness import QP, Case, Solution, Status, no_rows
+from mortarbench import QP, Case, Family, Solution, Status
 
 print("a plug-in says hello")
 
 @dataclass(frozen=True)
-class Pit:
-    name: str = "pit"
-    defaults = {"n": 3}
+class Pit(Family):
     forms = ("primal",)
-    def build(self, form, params, reference):
-        n = params["n"]
+    n: int = 3
+    def build(self, form, reference):
+        n = self.n
         print("a family says hello")
         if n == 99:
             raise ZeroDivisionError("no\\nbottom")
-        qp = QP(P=np.eye(n), q=-np.ones(n), A=no_rows(n), b=np.zeros(0),
-                G=no_rows(n), h=np.zeros(0), lb=np.zeros(n), ub=np.full(n, np.inf))
+        qp = QP.from_arrays(np.eye(n), -np.ones(n), lb=np.zeros(n))
         return Case(qp=qp, recover=lambda s: s.x, quantities=lambda s: {})
 
 @dataclass(frozen=True)
@@ -855,7 +853,7 @@ def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
 
 def test_the_module_is_the_same_command_from_any_folder(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "harness", "list", "suites"],
+        [sys.executable, "-m", "mortarbench", "list", "suites"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -864,7 +862,7 @@ def test_the_module_is_the_same_command_from_any_folder(tmp_path):
 
     assert [line.split()[0] for line in done.stdout.splitlines()] == [
         "accuracy", "crossover", "crossval", "demo", "discs", "fclib", "finite-strain",
-        "fixed-point", "fleet", "friction", "large", "paper", "paper-accuracy",
+        "fleet", "friction", "large", "paper", "paper-accuracy",
         "paper-fleet", "path", "ranks", "scaling", "scaling-feti", "smoke", "solids",
     ]  # fmt: skip
 

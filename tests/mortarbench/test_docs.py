@@ -49,12 +49,12 @@ def test_the_solver_of_the_contributing_guide_solves(tmp_path):
     path.write_text(code)
     solver = load_plugin(path).solvers["lbfgsb"]
     family = BeamRing()
-    params = family.complete({"Nr": 4, "Nh": 3, "steps": 1})
-    qp = family.build("dual-bounds", params, reference_solution).qp
+    configured = family.with_keys(Nr=4, Nh=3, steps=1)
+    qp = configured.build("dual-bounds", reference_solution).qp
     s = solver.prepare(qp, 1e-8)()
 
     assert len(code.splitlines()) < 30
-    assert solver.declines(family.build("primal", params, reference_solution).qp)
+    assert solver.declines(configured.build("primal", reference_solution).qp)
     assert kkt_residuals(qp, s).primal == 0
     assert qp.objective(s.x) - qp.objective(reference_solution(qp).x) <= 1e-7 * abs(
         qp.objective(s.x)

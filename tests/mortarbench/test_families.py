@@ -23,7 +23,7 @@ LATER = {
 CASES = [
     pytest.param(name, form, marks=[pytest.mark.slow] * (form in LATER.get(name, ())))
     for name, family in PROBLEMS.items()
-    if "path" not in family.defaults
+    if family.path_suffix is None
     for form in family.forms
 ]
 
@@ -35,7 +35,7 @@ def test_the_default_case_is_solved_and_verified_in_every_form(name, form, capsy
         report=None,
     )  # fmt: skip
     declined = SOLVERS["smalbe"].declines(
-        PROBLEMS[name].build(form, _defaults(name), reference_solution).qp
+        PROBLEMS[name].build(form, reference_solution).qp
     )
     solver = "clarabel" if declined else "smalbe"
     code = main(registries, ["solve", f"{name}/{form}", "--solver", solver, "--json"])
@@ -44,9 +44,3 @@ def test_the_default_case_is_solved_and_verified_in_every_form(name, form, capsy
     assert (code, record["status"]) == (0, "verified")
     assert record["case"] == f"{name}/{form}"
     assert record["quantities"]["energy"]
-
-
-def _defaults(name):
-    family = PROBLEMS[name]
-    complete = getattr(family, "complete", lambda given: {**family.defaults, **given})
-    return complete({})

@@ -243,12 +243,8 @@ LIGHT = [
     ["run", "--help"],
     ["--version"],
     ["list", "solvers"],
-    ["list", "problems", "--json"],
     ["list", "suites"],
-    ["solve", "beam-ring/Nr=0/dual", "--solver", "smalbe"],
-    ["solve", "beam-ring/dual", "--solver", "smalb"],
-    ["solve", "beam-ring/dual", "--solver", "smalbe", "--plot", "a.txt"],
-    ["export", "hertz-plane/Q=1/dual", "a.npz"],
+    ["solve", "beam-rin/dual", "--solver", "smalbe"],
     ["run", "dem"],
     ["report", "nowhere"],
     ["validate", "nowhere"],
@@ -283,7 +279,7 @@ def loaded(tmp_path_factory):
 
 
 @pytest.mark.parametrize("number", range(len(LIGHT)), ids=map(" ".join, LIGHT))
-def test_help_lists_and_refusals_import_no_numerical_library(loaded, number):
+def test_help_and_refusals_import_no_numerical_library(loaded, number):
     assert len(loaded) == len(LIGHT)
     assert loaded[number] == ["loaded"]
 

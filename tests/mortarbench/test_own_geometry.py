@@ -85,7 +85,7 @@ def test_the_refusals_quoted_on_the_page_are_the_actual_messages(solved):
     """The constant parts of the messages occur on the page and in the code."""
     code = "".join(
         path.read_text("utf-8")
-        for folder in ("problems/fem", "problems/contact", "problems/models")
+        for folder in ("problems/fem", "problems/contact", "problems/families")
         for path in (ROOT / folder).rglob("*.py")
     )
     for words in (

@@ -221,7 +221,7 @@ def test_a_new_problem_builds_the_named_case(starting):
     assert quantities["lowest"] == pytest.approx(-0.05, rel=1e-6)
     assert quantities["touching"] / 400 == pytest.approx(1 - 2 * 0.1**0.5, abs=0.01)
     assert starting(*solve[:1], "mine/n=1/primal", *solve[2:])[2] == (
-        "mortarbench: mine: n = 1; expected at least 2\n"
+        "mortarbench: mine: n=1 must be at least 2\n"
     )
 
 

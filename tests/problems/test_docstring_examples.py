@@ -10,7 +10,7 @@ import pytest
 from mortarbench.problems import elastic
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-MODULES = ["contact.friction", "fem.elasticity", "fem.mesh", "ranges"]
+MODULES = ["contact.friction", "fem.elasticity", "fem.mesh"]
 
 
 @pytest.mark.parametrize("name", MODULES)

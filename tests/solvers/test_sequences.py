@@ -23,9 +23,7 @@ def load_steps():
 
     def build(form):
         return [
-            family.build(
-                form, family.complete(dict(Nr=4, Nh=3, step=k)), reference_solution
-            ).qp
+            family.with_keys(Nr=4, Nh=3, step=k).build(form, reference_solution).qp
             for k in range(1, 11)
         ]
 

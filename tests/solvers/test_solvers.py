@@ -346,8 +346,8 @@ def test_highs_has_no_hidden_regularisation(manufactured):
 def test_highs_drops_no_small_entries(name):
     # a flexibility matrix in large units of force; entries below 1e-9 matter
     family = BeamRing()
-    params = family.complete({"Nr": 4, "Nh": 3, "steps": 1})
-    qp = family.build("dual", params, reference_solution).qp
+    configured = family.with_keys(Nr=4, Nh=3, steps=1)
+    qp = configured.build("dual", reference_solution).qp
     unit = 1e-5
     small = replace(qp, P=qp.P * unit, b=qp.b / unit)
     assert kkt_residuals(small, solve(name, small)).worst <= 1e-8

@@ -25,40 +25,38 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Case, Fields, InputError, Solution, Status, no_rows
 from mortarbench.harness.errors import PastEndError
-from mortarbench.harness.plugin import About
+from mortarbench.harness.plugin import About, Family
 from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.worker import Worker, serve
 from mortarbench.harness.verify import measure as measuring
 
 
 @dataclass(frozen=True)
-class Tiny:
-    name: str = "tiny"
-    forms: tuple[str, ...] = ("plain",)
+class Tiny(Family):
+    forms: ClassVar = ("plain",)
 
-    @property
-    def defaults(self):
-        return {"h": 1.0, "fault": "none"}
+    h: float = 1.0
+    fault: str = "none"
 
-    def build(self, form, params, reference):
-        if params["fault"] == "build":
+    def build(self, form, reference):
+        if self.fault == "build":
             raise ZeroDivisionError("no stiffness")
-        if params["fault"] == "input":
+        if self.fault == "input":
             raise InputError("tiny: fault=input is out of range")
-        if params["fault"] == "end":
+        if self.fault == "end":
             raise PastEndError("tiny: there is no further problem")
-        if params["fault"] == "memory":
+        if self.fault == "memory":
             raise MemoryError("Unable to allocate 1 PiB")
-        if params["fault"] == "exit":
+        if self.fault == "exit":
             sys.exit(3)
 
         def quantities(s):
-            if params["fault"] == "quantities":
+            if self.fault == "quantities":
                 raise ZeroDivisionError("no quantity")
             return {"first": s.x[0], "all": s.x, "number": np.int64(2)}
 
         def fields(s):
-            if params["fault"] == "fields":
+            if self.fault == "fields":
                 raise ZeroDivisionError("no field")
             square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
             return Fields(
@@ -69,7 +67,7 @@ class Tiny:
         qp = QP(
             P=csr_array(np.diag([2.0, 1.0])), q=np.array([-4.0, 3.0]),
             A=no_rows(2), b=np.zeros(0),
-            G=csr_array([[1.0, 0.0]]), h=np.array([params["h"]]),
+            G=csr_array([[1.0, 0.0]]), h=np.array([self.h]),
             lb=np.zeros(2), ub=np.full(2, np.inf),
         )  # fmt: skip
         return Case(
@@ -78,18 +76,15 @@ class Tiny:
 
 
 @dataclass(frozen=True)
-class Sized:
+class Sized(Family):
     """QPs  min ½|x|² + qᵀx, x ≥ 0  of any size with q > 0; the solution is x = 0."""
 
-    name: str = "sized"
-    forms: tuple[str, ...] = ("plain",)
+    forms: ClassVar = ("plain",)
 
-    @property
-    def defaults(self):
-        return {"n": 10}
+    n: int = 10
 
-    def build(self, form, params, reference):
-        n = params["n"]
+    def build(self, form, reference):
+        n = self.n
         qp = QP(
             P=csr_array(np.eye(n)), q=np.ones(n), A=no_rows(n), b=np.zeros(0),
             G=no_rows(n), h=np.zeros(0), lb=np.zeros(n), ub=np.full(n, np.inf),

@@ -321,8 +321,8 @@ def read(path):
             assert contact.W.shape == (contact.q.size,) * 2
             return True
         family = PROBLEMS["file"]
-        params = family.complete({"path": str(path)})
-        case = family.build("qp", params, None)
+        configured = family.with_keys(path=str(path))
+        case = configured.build("qp", None)
     except InputError as e:
         text = str(e)
         assert "\n" not in text

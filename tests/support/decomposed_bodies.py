@@ -1,7 +1,6 @@
 """Bodies decomposed into subdomains by labels of their cells, for tests."""
 
 from dataclasses import replace
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -20,14 +19,15 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
-from mortarbench.problems.duality.problem import elastic_bodies_of, qp_choice
-from mortarbench.problems.families.declared import ContactFamily
+from mortarbench.problems.duality.problem import elastic_bodies_of
+from mortarbench.problems.families.beam_ring import bodies as spectrum_of_beam_ring
+from mortarbench.problems.families.beam_ring import model
+from mortarbench.problems.families.contact import ContactFamily
+from mortarbench.problems.families.feti_models import DecomposedFamily
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomains import Contact, DecomposedProblem, TornBodies
-from mortarbench.problems.models.beam_ring import bodies as spectrum_of_beam_ring
-from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 
 
@@ -76,19 +76,15 @@ def parts_of(name: str) -> DecomposedProblem:
     """Return the decomposed dual of a case, after solving the earlier load steps."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
-        problem, choice = (
-            case.family.contact_problem(case.params),
-            qp_choice("dual", case.params),
-        )
+        problem, choice = case.family.contact_problem(), case.family.choice("dual")
         path = monolithic_path(problem, reference_solution)
-        whole, friction, _ = path.problem(choice.step, choice.iterate)
+        whole, friction, _ = path.problem(choice.step)
         of, stage = problem.bodies, problem.stages[path.last_of(choice.step)]
         contact = contact_of(whole.primal, friction)
         layout = of.shape.layout(choice.size)
         return decompose(of, layout, choice.glue, stage, contact)
-    models = import_module(f"mortarbench.problems.models.{case.family.name}")
-    found: DecomposedProblem = models.in_subdomains(case.params)
-    return found
+    assert isinstance(case.family, DecomposedFamily)
+    return case.family.in_subdomains()
 
 
 def decomposed_pair(

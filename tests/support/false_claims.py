@@ -6,36 +6,33 @@ The plug-in contains two families without mechanics: a membrane, and
 min ½(x + 1)², x ≤ 0.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.sparse import eye_array, tril
 
-from mortarbench.harness import QP, Case, Solution, Status, no_rows
+from mortarbench.harness import QP, Case, Family, Solution, Status, no_rows
 from mortarbench.harness.conformance.manufactured import membrane
 from mortarbench.solvers.common.conversion import csc
 from mortarbench.solvers.reference.solve import reference_solution
 
 
 @dataclass(frozen=True)
-class Membrane:
-    name: str = "membrane"
-    defaults: dict = field(default_factory=lambda: {"k": 12})
-    forms: tuple = ("qp",)
+class Membrane(Family):
+    forms: ClassVar = ("qp",)
 
-    def build(self, form, params, reference):
-        return Case(
-            qp=membrane(params["k"]), recover=lambda s: s.x, quantities=lambda s: {}
-        )
+    k: int = 12
+
+    def build(self, form, reference):
+        return Case(qp=membrane(self.k), recover=lambda s: s.x, quantities=lambda s: {})
 
 
 @dataclass(frozen=True)
-class Half:
-    name: str = "half"
-    defaults: dict = field(default_factory=dict)
-    forms: tuple = ("qp",)
+class Half(Family):
+    forms: ClassVar = ("qp",)
 
-    def build(self, form, params, reference):
+    def build(self, form, reference):
         qp = QP(
             P=np.eye(1), q=np.ones(1), A=no_rows(1), b=np.zeros(0),
             G=np.eye(1), h=np.zeros(1), lb=np.full(1, -np.inf), ub=np.full(1, np.inf),

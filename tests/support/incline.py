@@ -57,7 +57,7 @@ def block_on_incline(ratio: float, law: FrictionLaw, *, form: str = "dual") -> C
     of = elastic_bodies_of(bodies)
     problem = ContactProblem(
         bodies=of,
-        linearise=keyed_linearisation({"contact": "mortar", "basis": "dual"}),
+        linearise=keyed_linearisation("mortar", "dual"),
         stages=load_steps(1, 1, of.forces, of.fixed, (law,)),
         initial_force=float(np.abs(bodies.f).sum()),
     )  # fmt: skip

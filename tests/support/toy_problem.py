@@ -8,13 +8,24 @@ import os
 import signal
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from mortarbench.cli.main import main
-from mortarbench.harness import QP, Case, Fields, InputError, Solution, Status, no_rows
+from mortarbench.harness import (
+    QP,
+    Case,
+    Family,
+    Fields,
+    InputError,
+    Range,
+    Solution,
+    Status,
+    no_rows,
+)
 from mortarbench.registries import Registries
 
 FAULTS = {
@@ -26,20 +37,17 @@ FAULTS = {
 
 
 @dataclass(frozen=True)
-class Well:
+class Well(Family):
     """Separable quadratics over x ≥ 0."""
 
-    name: str = "well"
-    defaults: dict = field(default_factory=lambda: {"n": 3, "depth": 1})
-    forms: tuple = ("primal", "dual")
+    forms: ClassVar = ("primal", "dual")
 
-    def check(self, params):
-        if params["n"] < 1:
-            raise InputError(f"well: n={params['n']} must be at least 1")
+    n: Annotated[int, Range(1), "unknowns"] = 3
+    depth: int = 1
 
-    def build(self, form, params, reference):
+    def build(self, form, reference):
         """Return  min ½|x|² − depth·Σx, x ≥ 0:  x = depth, objective −n·depth²/2."""
-        n, depth = params["n"], params["depth"]
+        n, depth = self.n, self.depth
         if depth in FAULTS:
             raise FAULTS[depth]
         qp = QP(

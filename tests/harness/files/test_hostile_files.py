@@ -38,7 +38,7 @@ ADDRESS_SPACE = 2**29  #: additional bytes of address space for a refusal
 def build(path):
     """Build the case of a file, as commands do."""
     family = PROBLEMS["file"]
-    return family.build("qp", family.complete({"path": str(path)}), None)
+    return family.with_keys(path=str(path)).build("qp", None)
 
 
 @pytest.fixture

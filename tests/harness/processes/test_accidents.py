@@ -41,7 +41,7 @@ PLUGIN = ACCIDENTS
 START = [sys.executable, "-P", str(PLUGIN)]
 ACCIDENTS = load_plugin(PLUGIN)
 TINY = ACCIDENTS.problems["tiny"]
-CASE = assemble(TINY, {}, "plain")
+CASE = assemble("tiny", TINY, {}, "plain")
 
 FOREIGN = "was received, expected 'solved'"
 SUSPECT = "the solver reuses answers of earlier solves"
@@ -131,7 +131,7 @@ class Bench:
 
     def __init__(self, folder, *, memory_limit=400.0):
         self.folder, self.workers = folder, {}
-        self.qp = TINY.build("plain", TINY.defaults, None).qp
+        self.qp = TINY.build("plain", None).qp
         self.digest = save_qp(folder / "qp.npz", self.qp, {})
         self.memory_limit = memory_limit
 

@@ -183,9 +183,9 @@ def test_cases_that_ranks_cannot_divide_are_declined_before_any_rank_starts(
 )
 def test_a_case_has_as_many_ranks_as_subdomains(name, subdomains):
     case = parse(name, PROBLEMS)
-    family, keys = case.family, (case.form, case.params)
-    assert family.subdomains(*keys) == subdomains
-    assert (family.on_ranks(*keys) is None) == (subdomains == 1)
+    family = case.family
+    assert family.subdomains(case.form) == subdomains
+    assert (family.on_ranks(case.form) is None) == (subdomains == 1)
 
 
 @pytest.mark.parametrize("count", ["0", "-1", "5000"])

@@ -67,7 +67,7 @@ def ask(tmp_path):
     """Return a function that starts a worker and requests a solve of the tiny QP."""
     tiny = load_plugin(PLUGIN).problems["tiny"]
     qp = tmp_path / "qp.npz"
-    save_qp(qp, tiny.build("plain", tiny.defaults, None).qp, {})
+    save_qp(qp, tiny.build("plain", None).qp, {})
     request = {"qp": str(qp), "tol": 1e-6, "out": str(tmp_path / "point.npz")}
     workers = {}
 
@@ -199,7 +199,7 @@ def test_a_worker_that_is_never_ready_does_not_count_as_a_time_limit(ask, monkey
 
 def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
     tiny = load_plugin(PLUGIN).problems["tiny"]
-    save_qp(tmp_path / "qp.npz", tiny.build("plain", tiny.defaults, None).qp, {})
+    save_qp(tmp_path / "qp.npz", tiny.build("plain", None).qp, {})
     request = {"qp": str(tmp_path / "qp.npz"), "tol": 1e-6, "out": "unused"}
     arguments = [command("hangs"), request, str(tmp_path / "log")]
     parent = os.spawnv(

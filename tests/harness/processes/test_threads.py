@@ -310,15 +310,15 @@ def test_a_terminated_export_says_so_and_leaves_no_file(tmp_path):
 
 SLOW = """
 import os, time
+from dataclasses import dataclass
 from pathlib import Path
-from harness import Family
+from mortarbench import Family
 
+@dataclass(frozen=True)
 class Slow(Family):
-    name = "slow"
-    defaults = {}
     forms = ("primal",)
 
-    def build(self, form, params, reference):
+    def build(self, form, reference):
         Path(os.environ["STARTED"]).touch()
         time.sleep(3600)
 

@@ -4,6 +4,7 @@ built twice.
 
 import time
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -18,17 +19,16 @@ from mortarbench.harness.processes.cases import Cases
 class Slow(Family):
     """Family that reports ten times the time for its first dual case."""
 
-    name: str = "slow"
-    forms: tuple = ("primal", "dual")
-    defaults: dict = field(default_factory=lambda: {"n": 1})
-    built: list = field(default_factory=list)
+    forms: ClassVar = ("primal", "dual")
+    n: int = 1
+    built: list = field(default_factory=list, compare=False)
 
-    def build(self, form, params, reference):
+    def build(self, form, reference):
         self.built.append(form)
         seconds = None
         if form == "dual":
             seconds = 0.01 if self.built.count("dual") == 1 else 0.001
-        if params["n"] > 1:
+        if self.n > 1:
             time.sleep(0.05)
         A, b = no_rows(2), np.zeros(0)
         qp = QP(P=csc_array(np.eye(2)), q=np.ones(2), A=A, b=b, G=A, h=b,

@@ -367,10 +367,9 @@ def start(*arguments, **how):
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "
         "from mortarbench.registries import Registries; "
-        "from mortarbench.harness.plugin import as_family; "
-        "families = {k: as_family(f) for k, f in toy_problem.PROBLEMS.items()}; "
         "nothing = {'reference': None}; "
-        "sys.exit(main(Registries(families=families, solvers=toy_problem.SOLVERS, "
+        "sys.exit(main(Registries(families=toy_problem.PROBLEMS, "
+        "solvers=toy_problem.SOLVERS, "
         "report=lambda *_, **__: [], **nothing, "
         "start=(sys.executable, '-P', toy_problem.__file__)), sys.argv[2:]))"
     )

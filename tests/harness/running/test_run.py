@@ -78,7 +78,9 @@ def suite(*solvers, cases=({},), **changes):
         time_limit=30.0,
         memory_limit=2000.0,
         solvers=tuple(SolverSpec(name=s, label=s) for s in solvers),
-        cases=tuple(assemble(FAMILIES["tiny"], case, "plain") for case in cases),
+        cases=tuple(
+            assemble("tiny", FAMILIES["tiny"], case, "plain") for case in cases
+        ),
         text='name = "test"\n',
     )
     return replace(fixed, **changes)
@@ -124,9 +126,9 @@ OUTCOMES = {
     "raises": (
         Verdict.FAILED,
         "failed",
-        "ValueError: first line second line (adversaries.py:133)",
+        "ValueError: first line second line (adversaries.py:128)",
     ),
-    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:138)"),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:133)"),
     "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
     "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
     "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
@@ -153,7 +155,7 @@ OUTCOMES = {
     "zero": (Verdict.WRONG, "solved", None),
     "mutates": (
         Verdict.FAILED, "failed",
-        "ValueError: assignment destination is read-only (adversaries.py:375)",
+        "ValueError: assignment destination is read-only (adversaries.py:370)",
     ),
     # the timed solves are those of another QP, and the last one is judged
     "mutatesbyforce": (Verdict.FAILED, "failed", ""),
@@ -237,7 +239,9 @@ def test_a_record_contains_times_of_phases_threads_and_cpu(measure, tmp_path):
 
 
 def three_steps(*solvers, **changes):
-    names = [assemble(FAMILIES["tiny"], {"h": h}, "plain") for h in (0.5, 1.0, 1.5)]
+    names = [
+        assemble("tiny", FAMILIES["tiny"], {"h": h}, "plain") for h in (0.5, 1.0, 1.5)
+    ]
     return suite(*solvers, cases=(), sequences=(tuple(names),), **changes)
 
 
@@ -270,7 +274,7 @@ def test_a_sequence_and_a_cold_solve_of_a_case_are_two_measurements(measure, tmp
 
 def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_path):
     cases = ({"h": 0.5}, {"h": 1.0}, {"fault": "end"}, {"fault": "end", "h": 0.5})
-    names = tuple(assemble(FAMILIES["tiny"], case, "plain") for case in cases)
+    names = tuple(assemble("tiny", FAMILIES["tiny"], case, "plain") for case in cases)
     asked = suite("chains", "honest", cases=(), sequences=(names,))
     measure(asked)
     records = read_journal(tmp_path)
@@ -318,7 +322,7 @@ def test_answers_of_a_sweep_are_verified_at_one_accuracy(measure, tmp_path):
 def test_the_exponent_of_a_solver_that_sleeps_by_a_power_law_is_found(
     measure, tmp_path
 ):
-    sizes = [assemble(FAMILIES["sized"], {"n": n}, "plain") for n in SIZES]
+    sizes = [assemble("sized", FAMILIES["sized"], {"n": n}, "plain") for n in SIZES]
     measure(replace(suite("sleepsbypower", repeats=5), cases=tuple(sizes)))
     (series,) = size_series(read_evidence(tmp_path))
     law = series.time_law("sleepsbypower")

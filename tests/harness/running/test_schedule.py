@@ -1,7 +1,8 @@
 """Schedule of blocks: order and resumption."""
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -15,15 +16,17 @@ from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.suite import Suite
 
 
+@dataclass(frozen=True)
 class Squares(Family):
-    name, defaults, forms = "f", {"n": 1}, ("p",)
+    forms: ClassVar = ("p",)
+    n: int = 1
 
-    def build(self, form, params, reference):
+    def build(self, form, reference):
         raise AssertionError("it is only named, never run")
 
 
 def cases_of(*sizes):
-    return tuple(assemble(Squares(), {"n": n}, "p") for n in sizes)
+    return tuple(assemble("f", Squares(), {"n": n}, "p") for n in sizes)
 
 
 class Quiet:

@@ -3,14 +3,14 @@
 import re
 import tomllib
 from dataclasses import dataclass, field
-from types import SimpleNamespace
+from typing import Annotated, ClassVar
 
 import pytest
 
 from mortarbench import problems, solvers
 from mortarbench.cli.paper import BEYOND
-from mortarbench.harness import InputError
-from mortarbench.harness.plugin import as_family
+from mortarbench.harness import InputError, Range
+from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.suite.overrides import with_overrides
 from mortarbench.harness.suite.suite import load_suite
@@ -33,9 +33,24 @@ class Timed(Method):
     time_limit: int = 1
 
 
-def check(params):
-    if params["n"] < 1:
-        raise InputError(f"well: n={params['n']} must be at least 1")
+@dataclass(frozen=True)
+class Well(Family):
+    forms: ClassVar = ("primal", "dual")
+
+    n: Annotated[int, Range(1)] = 1
+    m: int = 1
+    kind: str = "soft"
+
+    def build(self, form, reference):
+        raise AssertionError("it is only named, never run")
+
+
+@dataclass(frozen=True)
+class Stored(Well):
+    forms: ClassVar = ("qp",)
+    path_suffix: ClassVar = ""
+
+    path: str = ""
 
 
 @dataclass(frozen=True)
@@ -46,13 +61,7 @@ class Tuned(Method):
 
 
 SOLVERS = {"osqp": Method(), "clarabel": Method(9), "other": Method(3)}
-WELL = SimpleNamespace(
-    name="well",
-    defaults={"n": 1, "m": 1, "kind": "soft"},
-    forms=("primal", "dual"),
-    check=check,
-)
-FAMILIES = {"well": as_family(WELL)}
+FAMILIES = {"well": Well()}
 
 HEAD = 'name = "demo"\nsolvers = ["osqp"]\n'
 BLOCK = '[[problems]]\nfamily = "well"\n'
@@ -423,7 +432,7 @@ def test_crossval_has_every_family_in_every_form_and_many_solvers():
     assert crossval.tolerances == (1e-8,)
     assert len(crossval.cases) >= 40
     assert len(crossval.solvers) >= 10
-    assert {(c.family.name, c.form) for c in crossval.cases} == {
+    assert {(c.family_name, c.form) for c in crossval.cases} == {
         (name, form)
         for name, family in problems.PROBLEMS.items()
         for form in family.forms
@@ -469,10 +478,7 @@ def patterned(folder, path):
     (folder / "s.toml").write_text(
         HEAD + f'[[problems]]\nfamily = "stored"\nparams = {{ path = {path} }}\n'
     )
-    stored = SimpleNamespace(
-        name="stored", defaults={"path": ""}, forms=("qp",), path_suffix=""
-    )
-    families = {"stored": as_family(SimpleNamespace(**vars(stored), build=None))}
+    families = {"stored": Stored()}
     return [
         c.params["path"] for c in load_suite(folder / "s.toml", families, SOLVERS).cases
     ]
@@ -675,7 +681,7 @@ def test_the_suite_of_the_crossover_reaches_a_million_dofs_in_2d_and_3d():
     suite = load_suite(
         ROOT / "suites/crossover.toml", problems.PROBLEMS, solvers.SOLVERS
     )
-    largest = {case.family.name: case.params for case in suite.cases}
+    largest = {case.family_name: case.params for case in suite.cases}
 
     p = largest["beam-ring"]
     nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1) + (12 * p["Nh"] + 1) * (p["radial"] + 1)

@@ -36,7 +36,7 @@ AT = {
 @pytest.fixture
 def qp():
     tiny = PLUGIN.problems["tiny"]
-    return tiny.build("plain", tiny.defaults, None).qp
+    return tiny.build("plain", None).qp
 
 
 def cost_of(*measured, **options):

@@ -6,7 +6,6 @@ problem, which is accurate up to rounding.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -25,8 +24,8 @@ from mortarbench.harness.verify.certificate import Certificate, certify_pair
 from mortarbench.harness.verify.substructured import Subdomains, neighbour
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
+from mortarbench.problems.families import hertz, patch
 from mortarbench.problems.feti.substructures import LocalProblems
-from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -50,13 +49,12 @@ NOISE = 1e-7  #: smallest relative error for which effectivities are measured
 
 
 def bodies_of(name: str) -> Bodies:
-    params: Mapping[str, Any] = parse(f"{name}/primal", PROBLEMS).params
+    family: Any = parse(f"{name}/primal", PROBLEMS).family
     if name.startswith("beam-ring"):
-        keys = ("Nr", "Nh", "radial", "plane")
-        return beam_ring.model(*(params[key] for key in keys))
+        return family.bodies().assembled
     if name.startswith("contact-patch"):
-        return patch.model(params)
-    return hertz.two_cylinders(params)[0].assembled
+        return patch.model(family)
+    return hertz.two_cylinders(family)[0].assembled
 
 
 def boxes(bodies: Bodies, parts: tuple[int, int]) -> Any:

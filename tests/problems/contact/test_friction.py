@@ -8,7 +8,6 @@ import pytest
 from scipy.sparse import csr_array
 
 from mortarbench.harness import Friction, InputError
-from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.problems.contact.bodies import ContactPair
 from mortarbench.problems.contact.friction import (
@@ -16,7 +15,6 @@ from mortarbench.problems.contact.friction import (
     coulomb_fixed_point,
     friction_of,
     law_of,
-    select_iterate,
 )
 from mortarbench.problems.contact.rows import ContactRows
 
@@ -104,24 +102,12 @@ def test_a_bound_without_equilibrium_is_named():
     assert "of Coulomb's law (no optimal point): friction cannot" in str(e.value)
 
 
-def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
-    problems = ["first", "second", "third"]
-
-    assert [select_iterate(problems, i, 1) for i in (0, 1, 2, 3)] == [
-        "third", "first", "second", "third",
-    ]  # fmt: skip
-    with pytest.raises(
-        PastEndError, match="iterate=4: the fixed-point iteration of step 5 has only 3"
-    ):
-        select_iterate(problems, 4, 5)
-
-
 def test_a_law_reads_only_its_own_parameter():
     keys = {"bound": 5.0, "mu": 0.3}
 
-    assert law_of({"friction": "none", **keys}) == FrictionLaw()
-    assert law_of({"friction": "tresca", **keys}) == FrictionLaw("tresca", bound=5.0)
-    assert law_of({"friction": "coulomb", **keys}) == FrictionLaw("coulomb", mu=0.3)
+    assert law_of("none", **keys) == FrictionLaw()
+    assert law_of("tresca", **keys) == FrictionLaw("tresca", bound=5.0)
+    assert law_of("coulomb", **keys) == FrictionLaw("coulomb", mu=0.3)
     assert [FrictionLaw(kind).acts for kind in ("none", "tresca", "coulomb")] == [
         False, True, True,
     ]  # fmt: skip

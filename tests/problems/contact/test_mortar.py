@@ -13,7 +13,7 @@ from mortarbench.problems.contact.mortar import (
     project,
 )
 from mortarbench.problems.contact.surface import Reach, surface
-from mortarbench.problems.models.beam_ring import model
+from mortarbench.problems.families.beam_ring import model
 
 BASES = ["dual", "standard"]
 ANY_ANGLE = Reach(cosine=1.0)

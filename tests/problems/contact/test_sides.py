@@ -9,9 +9,8 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.sides import contact_sides
 from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.families.hertz import HertzPlane
-from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.families.patch import PRESSURE, ContactPatch, model
 from mortarbench.problems.fem.mesh import nodal_lengths
-from mortarbench.problems.models.patch import PRESSURE, model
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.supported_by_contact import PRESSURE as PRESS
@@ -22,8 +21,8 @@ METHODS = [("nts", "dual"), ("mortar", "dual"), ("mortar", "standard")]
 
 @pytest.mark.parametrize(("contact", "basis"), METHODS[1:])
 def test_a_uniform_pressure_is_uniform_along_the_side(contact, basis):
-    params = {**ContactPatch().defaults, "contact": contact, "basis": basis}
-    case = ContactPatch().build("primal", params, reference_solution)
+    configured = ContactPatch().with_keys(contact=contact, basis=basis)
+    case = configured.build("primal", reference_solution)
     (side,) = case.fields(Clarabel().prepare(case.qp, 1e-12)()).contacts
 
     assert side.name == "upper on lower"
@@ -77,7 +76,7 @@ def test_neighbours_of_pressed_nodes_on_a_curved_side_do_not_press():
 
 
 def test_the_pressure_along_the_side_is_that_of_hertz():
-    case = HertzPlane().build("primal", HertzPlane().defaults, reference_solution)
+    case = HertzPlane().build("primal", reference_solution)
     s = Clarabel().prepare(case.qp, 1e-10)()
     values = case.quantities(s)
     pair = values["contacts"]["cylinder on rigid"]
@@ -90,7 +89,7 @@ def test_the_pressure_along_the_side_is_that_of_hertz():
 def test_a_node_without_a_row_has_no_gap_and_no_pressure():
     """The upper block is shifted by almost half its width, so that almost half of the
     slave side faces no master."""
-    bodies = model({**ContactPatch().defaults, "lower": 8, "upper": 8})
+    bodies = model(ContactPatch().with_keys(lower=8, upper=8))
     bodies.mesh.points[bodies.body_of_node == 1, 0] += 0.5 - 1e-3
     rows = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
@@ -111,7 +110,7 @@ def test_a_node_without_a_row_has_no_gap_and_no_pressure():
 
 def test_pairs_with_a_common_slave_side_have_their_own_rows():
     """Where the two masters meet, both pairs have the same row in nodal contact."""
-    bodies = model({**ContactPatch().defaults, "lower": 6, "upper": 4})
+    bodies = model(ContactPatch().with_keys(lower=6, upper=4))
     (pair,) = bodies.pairs
     left, right = pair.master[:3], pair.master[2:]
     object.__setattr__(

@@ -14,6 +14,8 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.stepping import forces_of, load_steps
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import load_path, primal_qp, recovered
+from mortarbench.problems.families.beam_ring import bodies as bodies_of
+from mortarbench.problems.families.beam_ring import model
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,
@@ -27,9 +29,6 @@ from mortarbench.problems.fem.inverse import (
     regular_inverse,
 )
 from mortarbench.problems.fem.mesh import dofs_of, half_ring, join, rectangle
-from mortarbench.problems.models.beam_ring import bodies as bodies_of
-from mortarbench.problems.models.beam_ring import model, problem
-from mortarbench.problems.models.solids.hertz_sphere import problem as sphere
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
 
@@ -205,7 +204,7 @@ def test_recovered_points_of_the_duals_solve_the_primal_problem():
 
 def test_eliminated_supports_may_leave_rigid_motions_which_contact_balances():
     """For Hertz's sphere, both duals recover the same displacement."""
-    elastic = sphere({**PROBLEMS["hertz-sphere"].defaults, "n": 1}).bodies
+    elastic = PROBLEMS["hertz-sphere"].with_keys(n=1).problem().bodies
     bodies = elastic.assembled
     rows = linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
@@ -295,12 +294,12 @@ def test_recovery_keeps_the_claim():
 def test_the_time_of_a_dual_includes_a_cached_factorisation(form):
     family = PROBLEMS["beam-ring"]
     for step in (1, 2):
-        params = family.complete(dict(Nr=3, Nh=2, step=step))
+        configured = family.with_keys(Nr=3, Nh=2, step=step)
         # the bodies of the same cached problem that `build` uses
-        bodies = problem(params).bodies
+        bodies = configured.contact_problem().bodies
         factor = {"dual": bodies.floating, "dual-bounds": bodies.clamped}[form]
         assert factor.seconds > 0
-        case = family.build(form, params, reference_solution)
+        case = configured.build(form, reference_solution)
         assert case.dualise_seconds > factor.seconds
 
 
@@ -349,8 +348,8 @@ def test_a_dual_solution_has_its_displacements_on_the_contact_sides(
     factorise, transform
 ):
     family, geometry = PROBLEMS["beam-ring"], (3, 2, 4, "strain")
-    params = family.complete({"Nr": 3, "Nh": 2})
-    primal = family.build("primal", params, reference_solution).qp
+    configured = family.with_keys(Nr=3, Nh=2)
+    primal = configured.build("primal", reference_solution).qp
     dual = transform(primal, getattr(bodies_of(*geometry), factorise))
     s = reference_solution(dual.qp)
     sides, u = np.unique(primal.G.nonzero()[1]), dual.recover(s).x

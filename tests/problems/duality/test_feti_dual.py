@@ -13,8 +13,8 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.duality.feti_dual import feti_dual
 from mortarbench.problems.duality.monolithic import primal_qp
+from mortarbench.problems.families.beam_ring import model
 from mortarbench.problems.feti.tearing import blocks
-from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.decomposed_bodies import decompose_by_labels, labelled
 

@@ -8,36 +8,39 @@ import pytest
 from scipy.sparse import csr_array, eye_array
 
 from mortarbench.harness import InputError
+from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.node_to_facet import (
     geometric_stiffness,
     node_to_facet,
 )
 from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality import newton
+from mortarbench.problems.duality.newton_case import newton_path
+from mortarbench.problems.families import beam_ring
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.problems.families.hertz import HertzPlane
 from mortarbench.problems.families.patch import ContactPatch
-from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers.reference.solve import reference_solution
 
 pytestmark = pytest.mark.together
 
 
 def ring_path(steps=2, contact_stiffness="geometric", contact="nts", size=2):
-    return beam_ring._newton_path(
-        (size, size, 2 * size, "strain"), (contact, "dual"), steps, "neo-hooke",
-        contact_stiffness, reference_solution,
+    family = BeamRing(
+        Nr=size, Nh=size, steps=steps, contact=contact, kinematics="finite",
+        contact_stiffness=contact_stiffness,
     )  # fmt: skip
+    return family.newton_path(reference_solution)
 
 
-def plane_path(**given):
-    params = HertzPlane().complete({"n": 3, "kinematics": "finite", **given})
-    return hertz._newton_path(tuple(params.items()), reference_solution)
+def plane_path(n=3, **given):
+    family = HertzPlane(n=n, kinematics="finite", **given)
+    return family.newton_path(reference_solution)
 
 
 def patch_path(**given):
-    params = ContactPatch().complete({"kinematics": "finite", **given})
-    return patch._newton_path(tuple(params.items()), reference_solution)
+    family = ContactPatch(kinematics="finite", **given)
+    return family.newton_path(reference_solution)
 
 
 def residuals(path, k=1):
@@ -659,7 +662,6 @@ def test_the_penalty_exceeds_every_previous_multiplier(monkeypatch):
         return move(self, at, posed, lam, weight, best)
 
     monkeypatch.setattr(newton.NewtonPath, "_line_search", spied)
-    hertz._newton_path.cache_clear()  # another test may have cached the path
     plane_path().iterations(1)
     assert len(seen) >= 3
     largest = np.maximum.accumulate([most for most, _ in seen])
@@ -680,14 +682,12 @@ def test_a_load_is_settled_by_a_full_step_to_equilibrium_and_no_earlier():
 def test_a_failed_load_step_is_subdivided(monkeypatch):
     whole = ring_path(steps=1)
     expected = whole.iterations(1)[-1].answer.x
-    beam_ring._newton_path.cache_clear()
     monkeypatch.setattr(newton, "MAX_ITERATIONS", 5)
     path = ring_path(steps=1)
 
     assert whole.parts(1) == 1
     assert path.parts(1) > 1
     np.testing.assert_allclose(path.iterations(1)[-1].answer.x, expected, atol=1e-9)
-    beam_ring._newton_path.cache_clear()
 
 
 def test_the_line_search_decreases_the_penalty_function():
@@ -728,7 +728,7 @@ def test_advice_is_a_larger_load_for_tiny_loads_and_a_smaller_one_otherwise(
         plane_path(load=1e-3).iterations(1)
     monkeypatch.setattr(newton, "MAX_ITERATIONS", 1)
     with pytest.raises(InputError, match=r"expected a smaller load"):
-        plane_path(load=9.0).iterations(1)  # not cached by another test
+        plane_path(load=9.0).iterations(1)
 
 
 def test_a_missing_iteration_is_refused():
@@ -749,14 +749,11 @@ def test_supports_that_leave_a_rotation_are_refused():
 
 def test_paths_are_those_of_the_keys():
     """The keys select the path, `step` its load step and `newton` the iteration."""
-    case = BeamRing().build(
-        "dual",
-        BeamRing().complete({
-            "Nr": 2, "Nh": 2, "steps": 2, "step": 1, "kinematics": "finite",
-            "contact_stiffness": "geometric", "newton": 2,
-        }),
-        reference_solution,
+    family = BeamRing(
+        Nr=2, Nh=2, steps=2, step=1, kinematics="finite",
+        contact_stiffness="geometric", newton=2,
     )  # fmt: skip
+    case = family.build("dual", reference_solution)
     found = ring_path().iteration(1, 2)
 
     np.testing.assert_array_equal(case.mechanics.primal.q, found.primal.q)
@@ -765,10 +762,8 @@ def test_paths_are_those_of_the_keys():
 def test_a_node_between_two_segments_keeps_one_of_them():
     """In step 6, a node of the ring alternates between two segments that share a
     vertex."""
-    path = beam_ring._newton_path(
-        (6, 4, 8, "strain"), ("nts", "dual"), 10, "neo-hooke", "geometric",
-        reference_solution,
-    )  # fmt: skip
+    family = BeamRing(Nr=6, Nh=4, kinematics="finite", contact_stiffness="geometric")
+    path = family.newton_path(reference_solution)
     kept = [path.iterations(k)[-1].gaps is not path.gaps for k in (5, 6)]
     last = path.iteration(6)
     _, residual, penetration = path.state(last, last.answer)
@@ -779,7 +774,11 @@ def test_a_node_between_two_segments_keeps_one_of_them():
 
 
 def test_contact_stiffness_needs_supported_bodies():
-    path = patch_path(contact="nts", contact_stiffness="geometric")
+    bodies = ContactPatch(kinematics="finite").finite_bodies()
+    path = newton_path(
+        bodies, linearisation(bodies, "nts", "dual"), reference_solution,
+        material="neo-hooke", contact="nts", stiffness="geometric",
+    )  # fmt: skip
 
     reason = "is not built for bodies supported by contact alone"
     with pytest.raises(InputError, match=reason):

@@ -9,7 +9,7 @@ from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
 case = parse("beam-ring/Nr=4/Nh=3/steps=1/dual", PROBLEMS)
-case.family.build("dual", case.family.complete(case.params), reference_solution)
+case.build(reference_solution)
 print([name for name in sys.modules if name.startswith("mortarbench.problems.feti")])
 """
 

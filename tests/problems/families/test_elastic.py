@@ -8,7 +8,7 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.elastic import FrictionLaw, one_step
-from mortarbench.problems.models.patch import model
+from mortarbench.problems.families.patch import model
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -29,9 +29,9 @@ STRETCHED = dict(lower=3, upper=2, ratio=3.0)
     ],
 )  # fmt: skip
 def test_a_case_of_one_step_equals_the_case_of_the_family(form, law, keys):
-    params = PATCH.complete(STRETCHED | keys)
-    case = PATCH.build(form, params, reference_solution)
-    own = one_step(model(params), form, friction=law, reference=reference_solution)
+    configured = PATCH.with_keys(**(STRETCHED | keys))
+    case = configured.build(form, reference_solution)
+    own = one_step(model(configured), form, friction=law, reference=reference_solution)
 
     for name in ("P", "q", "G", "h", "A", "b"):
         first, second = (getattr(c.qp, name) for c in (case, own))
@@ -53,7 +53,7 @@ def test_a_case_of_one_step_equals_the_case_of_the_family(form, law, keys):
 )  # fmt: skip
 def test_invalid_laws_are_refused_in_one_line(law, message):
     with pytest.raises(InputError) as e:
-        one_step(model(PATCH.complete({})), "dual", friction=law)
+        one_step(model(PATCH.with_keys()), "dual", friction=law)
 
     assert message in str(e.value)
     assert "\n" not in str(e.value)
@@ -61,7 +61,7 @@ def test_invalid_laws_are_refused_in_one_line(law, message):
 
 def test_friction_can_balance_a_tangential_load():
     """Without friction, the tangential load on the upper block is not balanced."""
-    bodies = model(PATCH.complete(STRETCHED))
+    bodies = model(PATCH.with_keys(**STRETCHED))
     upper = bodies.body_of_node == 1
     free = ~np.isin(bodies.B_D.indices, 2 * np.flatnonzero(upper))
     push = np.zeros(bodies.f.size)
@@ -78,7 +78,7 @@ def test_friction_can_balance_a_tangential_load():
 
 @pytest.mark.parametrize("glue", ["orthonormal", "redundant"])
 def test_decomposed_bodies_have_the_solution_of_undecomposed_ones(glue):
-    bodies = model(PATCH.complete(STRETCHED | {"lower": 5, "upper": 4}))
+    bodies = model(PATCH.with_keys(**(STRETCHED | {"lower": 5, "upper": 4})))
     law = FrictionLaw("tresca", bound=1e5)
     whole = one_step(bodies, "dual", friction=law)
     parts = one_step(bodies, "dual", friction=law, parts=5, glue=glue)
@@ -94,8 +94,8 @@ def test_decomposed_bodies_have_the_solution_of_undecomposed_ones(glue):
     ("form", "keys", "message"),
     [("primal", {"parts": 5}, "parts with form primal is not built"),
      ("dual", {"parts": 1}, "parts=1 for 2 bodies"),
-     ("dual", {"parts": 5, "glue": "tape"}, "glue='tape' is unknown")],
+     ("dual", {"parts": 5, "glue": "tape"}, "glue 'tape'; expected")],
 )  # fmt: skip
 def test_impossible_decompositions_are_refused(form, keys, message):
     with pytest.raises(InputError, match=message):
-        one_step(model(PATCH.complete({})), form, **keys)
+        one_step(model(PATCH.with_keys()), form, **keys)

@@ -18,9 +18,9 @@ from mortarbench.problems.contact.rows import ContactRows, rows_along
 from mortarbench.problems.contact.stepping import forces_of, load_steps
 from mortarbench.problems.contact.surface import tangents
 from mortarbench.problems.duality.monolithic import load_path
+from mortarbench.problems.families.patch import model
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, rectangle
-from mortarbench.problems.models.patch import model
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.incline import WEIGHT, block_on_incline, incline
 
@@ -171,7 +171,7 @@ def test_a_bound_is_the_traction_times_the_share_of_the_node(contact, basis):
 
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
 def test_tangential_rows_vanish_on_common_motions_of_both_sides(contact):
-    bodies = model(PROBLEMS["contact-patch"].defaults)
+    bodies = model(PROBLEMS["contact-patch"])
     law = (FrictionLaw("tresca", bound=1.0),)
     rows = linearisation(bodies, contact, "dual", law)(np.zeros(bodies.mesh.dofs))
     along = np.tile([1.0, 0.0], len(bodies.mesh.points))
@@ -274,27 +274,6 @@ def test_quasi_static_slip_starts_from_the_previous_step():
     assert kkt_residuals(path.qp, s).worst < 1e-9
 
 
-def test_iterates_are_the_tresca_problems_of_the_fixed_point_iteration():
-    """From the second iterate on, the bound is mu times the preceding normal force."""
-    name = f"{SMALL}/friction=coulomb/mu=0.3"
-    _, _, first = solved(f"{name}/iterate=1/dual-bounds")
-    _, _, smooth = solved(f"{SMALL}/dual-bounds")
-    last, _, _ = solved(f"{name}/dual-bounds")
-    # the first bound is zero
-    assert first["tip"] == pytest.approx(smooth["tip"], rel=1e-8)
-    residuals = []
-    for k in (1, 2, 3, 4):
-        case, s, values = solved(f"{name}/iterate={k}/dual-bounds")
-        after, _, _ = solved(f"{name}/iterate={k + 1}/dual-bounds")
-        m = case.mechanics.primal.h.size
-        demanded = 0.3 * s.x[:m]
-
-        assert after.qp.ub[m:] == pytest.approx(demanded, abs=1e-9)
-        assert (after.qp.P == last.qp.P).all()
-        residuals.append(values["friction_residual"])
-    assert residuals[1:] == sorted(residuals[1:], reverse=True)
-
-
 REFUSED = [
     ("beam-ring/friction=sliding/dual", "expected 'none' or 'tresca' or 'coulomb'"),
     ("beam-ring/friction=tresca/dual", "friction=tresca needs bound, a traction"),
@@ -307,7 +286,6 @@ REFUSED = [
         "contact-patch/loading=static/dual",
         "loading=static is not used by friction=none",
     ),
-    ("beam-ring/friction=tresca/bound=1/iterate=2/dual", "iterate=2 is not used by"),
     ("beam-ring/friction=coulomb/mu=1/loading=slow/dual", "'quasi-static' or 'static'"),
     ("hertz-plane/friction=coulomb/dual", "unknown key 'friction'"),
     ("obstacle/mu=0.3/primal", "unknown key 'mu'"),
@@ -356,11 +334,3 @@ def test_a_divergent_fixed_point_iteration_ends_with_its_last_residual(load):
     )
     with pytest.raises(InputError, match=message):
         path.problem(1)
-
-
-def test_an_iterate_beyond_the_last_one_is_refused():
-    name = f"{SMALL}/friction=coulomb/mu=0.3/iterate=900/dual-bounds"
-    with pytest.raises(
-        InputError, match="iterate=900: the fixed-point iteration of step 1"
-    ):
-        parse(name, PROBLEMS).build(reference_solution)

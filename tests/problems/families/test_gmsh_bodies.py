@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.harness.names import parse
+from mortarbench.harness.names import assemble, parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import assemble_stiffness
+from mortarbench.problems.families.beam_ring import model
+from mortarbench.problems.families.description import read_bodies
 from mortarbench.problems.fem.mesh import Mesh, nodal_lengths
 from mortarbench.problems.fem.mesh_files.reading import read_msh
-from mortarbench.problems.models.beam_ring import model
-from mortarbench.problems.models.description import read_bodies
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT, press
@@ -190,7 +190,7 @@ def read_mesh_of_quads(tmp_path, *contents):
     [
         pytest.param(keys, form, marks=[pytest.mark.slow] * (i % 2 == j))
         for i, keys in enumerate([
-            "", "/step=1", "/contact=mortar", "/relin=2/plane=stress",
+            "", "/step=1", "/contact=mortar", "/plane=stress",
             "/kinematics=finite",
             "/kinematics=finite/material=svk/contact_stiffness=geometric/newton=2/step=1",
         ])
@@ -198,8 +198,6 @@ def read_mesh_of_quads(tmp_path, *contents):
     ],
 )  # fmt: skip
 def test_the_user_s_qp_is_that_of_the_benchmark(described, keys, form):
-    if "mortar" in keys and "basis" not in PROBLEMS["beam-ring"].defaults:
-        pytest.skip("beam-ring has no mortar here")
     theirs = build(f"beam-ring/Nr={NR}/Nh={NH}/steps=2{keys}/{form}")
     ours = build(f"{described()}{keys}/{form}")
 
@@ -239,7 +237,7 @@ def test_the_file_may_request_finite_strain(described):
 
     assert (params["kinematics"], params["material"]) == ("finite", "svk")
     described(toml='kinematics = "large"\n' + TOML)
-    with pytest.raises(InputError, match=r"a\.toml: .*value of kinematics"):
+    with pytest.raises(InputError, match=r"a\.toml: kinematics='large' is"):
         parse("bodies:a.toml/dual", PROBLEMS)
 
 
@@ -270,7 +268,7 @@ def test_a_change_of_either_file_changes_the_case(described, tmp_path, which):
 
     assert before.params["sha256"] != after.params["sha256"]
     with pytest.raises(InputError, match=r"a\.toml: its content has the digest"):
-        PROBLEMS["bodies"].build("dual", before.params, reference_solution)
+        assemble("bodies", before.family, before.params, "dual")
 
 
 def test_loads_on_a_boundary_are_spread_by_the_shape_functions(described):
@@ -301,7 +299,7 @@ def test_bodies_held_only_by_contact_have_one_qp_and_no_load_path(described):
     dual = build(f"{text}/steps=1/dual")
     assert dual.qp.b.size == 6
     assert build(f"{text}/steps=1/primal").qp.b.size == 2 * 2 * 3
-    with pytest.raises(InputError, match=r"expected steps=1 and relin=1"):
+    with pytest.raises(InputError, match=r"expected steps=1"):
         build(f"{text}/dual")
     with pytest.raises(InputError, match=r"dual-bounds does not exist"):
         build(f"{text}/steps=1/dual-bounds")
@@ -379,17 +377,6 @@ def test_a_block_held_by_friction_is_loaded_in_steps(
     assert u == pytest.approx(expected, abs=1e-9 * abs(expected).max())
     force = case.quantities(s)["contacts"]["upper on lower"]["force"]["upper"]
     assert force == pytest.approx(share * np.array([-8e5, 2e6]), abs=1)
-
-
-def test_relinearisation_has_no_effect_if_rows_do_not_change(
-    sheared_blocks,
-):
-    once = build(f"{sheared_blocks()}/steps=1/dual")
-    again = build(f"{sheared_blocks()}/steps=1/relin=3/dual")
-
-    assert once.quantities(reference_solution(once.qp))["energy"] == pytest.approx(
-        again.quantities(reference_solution(again.qp))["energy"], rel=1e-9
-    )
 
 
 def test_more_shear_than_friction_allows_is_refused_in_every_step(sheared_blocks):
@@ -526,8 +513,8 @@ def test_nodes_of_no_cell_are_left_out(described):
         ('mesh = "two.msh"', 'mesh = "too.msh"', "too.msh: No such file"),
         ('mesh = "two.msh"\n', "", "a.toml: mesh is missing"),
         ("steps", "stops", "a.toml: unknown key 'stops'; did you mean 'steps'?"),
-        ("steps = 2", "steps = 2.5", "a.toml: steps = 2.5; expected an integer"),
-        ("steps = 2", 'plane = "bent"', "a.toml: unknown value of plane 'bent'"),
+        ("steps = 2", "steps = 2.5", "a.toml: steps=2.5; expected an integer"),
+        ("steps = 2", 'plane = "bent"', "a.toml: plane='bent' is unknown"),
         ("steps = 2", 'length_unit = "mn"', "a.toml: unknown length_unit 'mn'; did"),
         ("steps = 2", "length_unit = 1e-3", "a.toml: length_unit = 0.001; expected"),
         ("steps = 2", "steps 2", "a.toml: line "),
@@ -575,7 +562,7 @@ def test_a_bad_description_is_refused_with_file_entry_and_remedy(
     with pytest.raises(InputError) as e:
         build(f"{text}/dual")
 
-    assert str(e.value).startswith(message)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 
@@ -843,7 +830,7 @@ def test_a_bad_name_is_refused(described, text, message):
     with pytest.raises(InputError) as e:
         parse(text, PROBLEMS)
 
-    assert str(e.value).startswith(message)
+    assert message in str(e.value)
 
 
 def test_friction_is_the_same_from_the_key_the_file_or_the_pair(

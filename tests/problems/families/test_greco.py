@@ -9,8 +9,7 @@ from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.families.greco import Greco
-from mortarbench.problems.models.greco import PUBLISHED
+from mortarbench.problems.families.greco import PUBLISHED, Greco
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -28,7 +27,7 @@ PROTOTYPE = {
 
 @cache
 def solved(n, form="dual-bounds", tol=1e-10, **keys):
-    case = FAMILY.build(form, FAMILY.complete({"n": n, **keys}), reference_solution)
+    case = FAMILY.with_keys(n=n, **keys).build(form, reference_solution)
     s = SMALBE().prepare(case.qp, tol)()
     assert kkt_residuals(case.qp, s).worst <= 10 * tol
     return case, s
@@ -74,7 +73,7 @@ def test_forces_are_in_equilibrium():
 def test_every_form_has_the_same_answer():
     energies = []
     for form in FAMILY.forms:
-        case = FAMILY.build(form, FAMILY.complete({"n": 4}), reference_solution)
+        case = FAMILY.with_keys(n=4).build(form, reference_solution)
         s = reference_solution(case.qp)
         got = case.quantities(s)
         objective = case.scale * case.qp.objective(s.x) + case.constant
@@ -82,20 +81,6 @@ def test_every_form_has_the_same_answer():
         energies.append(got["energy"])
 
     assert energies == pytest.approx(energies[:1] * 3, rel=1e-8)
-
-
-def test_the_fixed_point_begins_without_friction_and_contracts():
-    """The key `iterate` selects each Tresca problem of the fixed-point iteration."""
-    case, s = solved(8)
-    count, residuals = case.quantities(s)["tresca_problems"], []
-    for i in range(1, count + 1):
-        case, s = solved(8, iterate=i)
-        residuals.append(case.quantities(s)["friction_residual"])
-
-    assert case.qp.ub[8:].max() > 0.1
-    assert solved(8, iterate=1)[0].qp.ub[8:] == pytest.approx(0)
-    assert residuals[-1] < 1e-8
-    assert (np.divide(residuals[2:9], residuals[1:8]) < 0.7).all()
 
 
 def test_without_friction_there_is_no_tangential_force():
@@ -108,21 +93,13 @@ def test_without_friction_there_is_no_tangential_force():
 @pytest.mark.parametrize(
     ("name", "message"),
     [("n=1", "greco: n=1 must be at least 2"),
-     ("mu=-0.5", "greco: mu=-0.5; expected a coefficient of friction of 0 or more"),
-     ("iterate=-1", "greco: iterate=-1 must be at least 0")],
+     ("mu=-0.5", "greco: mu=-0.5 must be between 0 and")],
 )  # fmt: skip
 def test_values_out_of_range_are_refused(name, message):
     with pytest.raises(InputError) as e:
         parse(f"greco/{name}/dual", PROBLEMS)
 
     assert message in str(e.value)
-
-
-def test_an_iterate_beyond_the_last_is_refused():
-    with pytest.raises(
-        InputError, match="iterate=99: the fixed-point iteration of step"
-    ):
-        solved(2, iterate=99)
 
 
 @pytest.mark.parametrize(
@@ -134,8 +111,8 @@ def test_an_iterate_beyond_the_last_is_refused():
 def test_every_layer_of_the_extruded_plate_is_the_plane_one(n, depth, form):
     points, states, u = [], [], []
     for keys in ({}, {"dim": 3, "depth": depth}):
-        params = FAMILY.complete({"n": n, **keys})
-        case = FAMILY.build(form, params, reference_solution)
+        configured = FAMILY.with_keys(n=n, **keys)
+        case = configured.build(form, reference_solution)
         s = reference_solution(case.qp)
         fields, values = case.fields(s), case.quantities(s)
         (side,) = fields.contacts
@@ -159,4 +136,4 @@ def test_every_layer_of_the_extruded_plate_is_the_plane_one(n, depth, form):
 
 def test_layers_in_the_plane_are_refused():
     with pytest.raises(InputError, match="depth=2 is not used by dim=2"):
-        FAMILY.check(FAMILY.complete({"depth": 2}))
+        FAMILY.with_keys(depth=2)

@@ -10,15 +10,15 @@ from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.families.half_plane import HalfPlane
-from mortarbench.problems.models.half_plane import (
+from mortarbench.problems.families.half_plane import (
     EXACT,
     MU,
     Elements,
+    HalfPlane,
     displacement,
     self_energy,
 )
-from mortarbench.problems.models.line_contact import TangentialContact
+from mortarbench.problems.families.line_contact import TangentialContact
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -28,7 +28,7 @@ TOL = 1e-9
 
 
 def result(solver=None, **keys):
-    case = FAMILY.build("dual", FAMILY.complete(keys), reference_solution)
+    case = FAMILY.with_keys(**keys).build("dual", reference_solution)
     s = (solver or SMALBE()).prepare(case.qp, TOL)()
     assert kkt_residuals(case.qp, s).worst <= 10 * TOL
     return case.quantities(s)

@@ -13,17 +13,17 @@ from mortarbench.harness.names import parse
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import OPERATORS, PROBLEMS
-from mortarbench.problems.families.half_space import HalfSpace
-from mortarbench.problems.models.half_space.influence import (
+from mortarbench.problems.families.half_space.cases import HalfSpace
+from mortarbench.problems.families.half_space.influence import (
     Influence,
     cell_integrals,
     influence_operator,
 )
-from mortarbench.problems.models.half_space.point_contact import (
+from mortarbench.problems.families.half_space.point_contact import (
     PointContact,
     ShearedPointContact,
 )
-from mortarbench.problems.models.half_space.rough_surface import (
+from mortarbench.problems.families.half_space.rough_surface import (
     LONGEST,
     SHORTEST,
     rough_surface,
@@ -41,7 +41,7 @@ EXACT = PointContact(100.0, 4e-3, 1e11)
 
 
 def built(**keys):
-    return FAMILY.build("dual", FAMILY.complete(keys), reference_solution)
+    return FAMILY.with_keys(**keys).build("dual", reference_solution)
 
 
 def result(solver=None, **keys):
@@ -419,11 +419,11 @@ def test_rough_spheres_touch_on_less_area_under_higher_pressure():
 @pytest.mark.parametrize(
     ("keys", "text"),
     [
-        (dict(n=3), "half-space: n=3 must be at least 4"),
+        (dict(n=3), "n=3 must be between 4 and 8192"),
         (dict(law="flat"), "expected 'hertz' or 'mindlin' or 'rough'"),
-        (dict(nu=0.6), "half-space: nu=0.6 must be between 0 and 0.5"),
+        (dict(nu=0.6), "nu=0.6 must be between 0 and 0.5"),
         (dict(law="mindlin", Q=1), "Q=1 must be between 0 and 1"),
-        (dict(law="mindlin", mu=-1), "mu=-1 must be positive"),
+        (dict(law="mindlin", mu=-1), "mu=-1 must be between 1e-30"),
         (dict(Q=0.3), "Q=0.3 is not used by law=hertz with friction=none"),
         (dict(seed=1), "seed=1 is not used by law=hertz"),
         (dict(law="mindlin", roughness=0.1), "roughness=0.1 is not used by law=mindl"),
@@ -438,7 +438,7 @@ def test_rough_spheres_touch_on_less_area_under_higher_pressure():
 )
 def test_wrong_keys_are_refused_in_one_line(keys, text):
     with pytest.raises(InputError) as e:
-        FAMILY.check(FAMILY.complete(keys))
+        FAMILY.with_keys(**keys)
     assert text in str(e.value)
     assert "\n" not in str(e.value)
 
@@ -446,7 +446,7 @@ def test_wrong_keys_are_refused_in_one_line(keys, text):
 def test_a_grid_that_does_not_fit_into_memory_is_refused(monkeypatch):
     monkeypatch.setenv("MORTARBENCH_CASE_MIB", "100")
     with pytest.raises(InputError, match="600 × 600 cells takes"):
-        FAMILY.check(FAMILY.complete(dict(n=600)))
+        FAMILY.with_keys(n=600)
 
 
 def test_the_canonical_name_lists_keys_in_the_order_of_the_family():

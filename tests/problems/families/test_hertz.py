@@ -11,9 +11,12 @@ from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.families.hertz import HertzCylinder, HertzPlane
-from mortarbench.problems.models.hertz import problem, two_cylinders
-from mortarbench.problems.models.line_contact import LineContact
+from mortarbench.problems.families.hertz import (
+    HertzCylinder,
+    HertzPlane,
+    two_cylinders,
+)
+from mortarbench.problems.families.line_contact import LineContact
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -30,7 +33,7 @@ PAIRINGS = [("mortar", "dual"), ("mortar", "standard"), ("nts", "dual")]
 @cache
 def solved(family, form="dual", **keys):
     """Return the case and its verified solution."""
-    case = family.build(form, {**family.defaults, **keys}, reference_solution)
+    case = family.with_keys(**keys).build(form, reference_solution)
     s = SOLVERS[form].prepare(case.qp, TOL / 2)()
     assert kkt_residuals(case.qp, s).worst <= 10 * TOL
     return case, s
@@ -126,7 +129,7 @@ def test_cylinders_of_unequal_materials_are_in_hertz_contact(contact, basis):
 def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
     """The bodies are two equal cylinders, and a cylinder on one of half the modulus."""
     equal, softer = (
-        two_cylinders({**CYLINDER.defaults, "load": 10.0, **keys})[1]
+        two_cylinders(CYLINDER.with_keys(load=10.0, **keys))[1]
         for keys in ({}, {"ratio": 0.5})
     )
 
@@ -172,16 +175,16 @@ def test_errors_on_fine_meshes_are_those_of_finite_bodies(n):
 @pytest.mark.parametrize(
     ("family", "bad", "message"),
     [
-        (PLANE, {"n": 0}, "hertz-plane: n=0 must be at least 1"),
-        (PLANE, {"load": -1.0}, "hertz-plane: load=-1.0 must be positive"),
-        (CYLINDER, {"m": 0}, "hertz-cylinder: m=0 must be at least 1"),
-        (CYLINDER, {"ratio": 0.0}, "hertz-cylinder: ratio=0.0 must be positive"),
+        (PLANE, {"n": 0}, "n=0 must be at least 1"),
+        (PLANE, {"load": -1.0}, "load=-1.0 must be between 1e-30 and"),
+        (CYLINDER, {"m": 0}, "m=0 must be at least 1"),
+        (CYLINDER, {"ratio": 0.0}, "ratio=0.0 must be between 1e-30 and"),
         (CYLINDER, {"contact": "glue"}, "contact='glue' is unknown"),
     ],
 )
 def test_values_out_of_range_are_refused(family, bad, message):
     with pytest.raises(InputError) as e:
-        family.check({**family.defaults, **bad})
+        family.with_keys(**bad)
 
     assert message in str(e.value)
 
@@ -191,9 +194,7 @@ COULOMB = dict(n=20, m=20, friction="coulomb", mu=0.3)
 
 @cache
 def sheared_result(form="dual", **keys):
-    case = CYLINDER.build(
-        form, CYLINDER.complete({**COULOMB, **keys}), reference_solution
-    )
+    case = CYLINDER.with_keys(**{**COULOMB, **keys}).build(form, reference_solution)
     s = SOLVERS[form].prepare(case.qp, TOL)()
     assert kkt_residuals(case.qp, s).worst <= 10 * TOL
     return case.quantities(s)
@@ -267,8 +268,8 @@ def test_the_tangential_force_rotates_no_body():
     """The loads on each body have no moment and the resultant ±Q, and reactions at the
     supports are negligible."""
     keys = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
-    params = CYLINDER.complete(keys)
-    stated = problem(params)
+    configured = CYLINDER.with_keys(**keys)
+    stated = configured.problem()
     first, last = stated.stages[0].forces, stated.stages[-1].forces
     bodies = stated.bodies.assembled
     (x, y), upper = bodies.mesh.points.T, bodies.body_of_node == 0
@@ -276,7 +277,7 @@ def test_the_tangential_force_rotates_no_body():
     load[last.component] = last.value / (0.5 * 0.5)  # unit of Q is μP
     load[first.component] -= first.value / (0.5 * 0.5)
     load = load.reshape(-1, 2)
-    case = CYLINDER.build("dual", params, reference_solution)
+    case = configured.build("dual", reference_solution)
 
     for body, Q in ((upper, 1.0), (~upper, -1.0)):
         assert load[body].sum(axis=0) == pytest.approx([Q, 0], abs=1e-12)
@@ -296,7 +297,7 @@ def test_the_tangential_force_rotates_no_body():
 def test_slip_starts_from_the_symmetric_position_of_the_cylinders(keys):
     """Without friction, the cylinders could roll on each other under P."""
     keys |= dict(n=5, m=4, friction="coulomb", mu=0.4, Q=0.6)
-    case = CYLINDER.build("dual", CYLINDER.complete(keys), reference_solution)
+    case = CYLINDER.with_keys(**keys).build("dual", reference_solution)
     friction = case.mechanics.friction
     begins = friction.start[friction.bound > 0]
 
@@ -313,35 +314,24 @@ def test_friction_holds_equal_cylinders_together_without_a_force():
     assert got["dissipation"] < 1e-5 * abs(got["energy"])
 
 
-def test_every_tresca_problem_of_a_fixed_point_is_available():
-    count = sheared_result(n=5, m=5, Q=0.5)["tresca_problems"]
-    residuals = [
-        sheared_result(n=5, m=5, Q=0.5, iterate=i)["friction_residual"]
-        for i in range(1, count + 1)
-    ]
-
-    assert 2 <= count <= 10
-    assert np.divide(residuals[1:], residuals[:-1]).max() < 0.2
-
-
 @pytest.mark.parametrize(
     ("keys", "message"),
     [("Q=0.5", "friction=none is not supported with a tangential force"),
      ("friction=tresca/bound=1e6/Q=0.5", "expected friction=coulomb, or no Q"),
      ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a fraction of μP"),
-     ("friction=coulomb/mu=0/Q=0.5", "mu=0.0 must be positive"),
+     ("friction=coulomb/mu=0/Q=0.5", "mu=0.0 must be between 1e-30 and"),
      ("friction=coulomb/mu=0.3/Q=0.6/peak=0.4", "must be between -peak and peak=0.4"),
      ("friction=coulomb/mu=0.3/Q=0.5/ratio=2", "expected ratio=1.0, or no Q"),
      ("friction=coulomb/mu=0.3/programme=proportional", "proportional requires Q > 0"),
      ("friction=coulomb/mu=0.3/Q=0.2/peak=0.4/programme=proportional",
       "proportional requires Q > 0 and peak=Q"),
-     ("friction=coulomb/mu=0.3/Q=0.5/steps=5", "expected programme=proportional"),
+     ("friction=coulomb/mu=0.3/Q=0.5/steps=5", "expected no steps, or programme="),
      ("friction=coulomb/mu=0.3/Q=0.2/peak=0.5/loading=static",
       "peak=0.5 is not used by loading=static"),
      ("friction=coulomb/mu=0.3/Q=0.5/programme=both", "programme='both' is unknown")],
 )  # fmt: skip
 def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, message):
-    with pytest.raises(InputError, match="hertz-cylinder: ") as e:
+    with pytest.raises(InputError) as e:
         parse(f"hertz-cylinder/{keys}/dual", PROBLEMS)
 
     assert message in str(e.value)
@@ -351,8 +341,7 @@ def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, message)
 @pytest.mark.parametrize("ratio", [1e-5, 1e-6, 1e-9, 1e-10, 1e-12])
 def test_cells_keep_their_area_if_the_contact_is_wider_than_the_cylinder(ratio):
     """If the uniformly meshed arc left the half disc, K would be indefinite."""
-    params = parse(f"hertz-cylinder/n=3/m=2/ratio={ratio}/primal", PROBLEMS).params
-    bodies, exact = two_cylinders(params)
+    bodies, exact = two_cylinders(HertzCylinder(n=3, m=2, ratio=ratio))
     assert exact.a > 4 * 0.008
     mesh = bodies.shape.mesh
     x, y = np.moveaxis(mesh.points[mesh.cells], -1, 0)

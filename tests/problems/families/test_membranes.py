@@ -1,4 +1,4 @@
-"""Two membranes: PERMON's model problem, with the sizes of its table."""
+"""Two PERMON's model problem, with the sizes of its table."""
 
 from dataclasses import replace
 
@@ -11,8 +11,8 @@ from mortarbench.harness import InputError, Solution, Status
 from mortarbench.harness.files.matfile import read_mat, save_mat
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
+from mortarbench.problems.families.feti_models import Membranes, hat_integrals
 from mortarbench.problems.fem.laplacian import grid_stiffness
-from mortarbench.problems.models.membranes import hat_integrals
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -31,7 +31,7 @@ PERMON = {
 
 
 def built(form, **params):
-    return FAMILY.build(form, params, reference_solution)
+    return Membranes(**params).build(form, reference_solution)
 
 
 def solution(case):
@@ -152,9 +152,9 @@ def test_the_mat_file_contains_the_dual_in_the_notation_of_the_paper(tmp_path):
 
 def test_values_out_of_range_are_refused():
     for params, message in (
-        ({"S": 0}, "membranes: S=0 must be at least 1"),
-        ({"n": 0}, "membranes: n=0 must be at least 1"),
-        ({"glue": "tape"}, "membranes: glue='tape' is unknown"),
+        ({"S": 0}, "S=0 must be at least 1"),
+        ({"n": 0}, "n=0 must be at least 1"),
+        ({"glue": "tape"}, "glue='tape' is unknown"),
     ):
         with pytest.raises(InputError, match=message):
-            FAMILY.check(FAMILY.complete(params))
+            Membranes(**params)

@@ -5,9 +5,9 @@ import pytest
 
 from mortarbench.harness import InputError
 from mortarbench.harness.verify.kkt import kkt_residuals
-from mortarbench.problems.families.obstacle import Obstacle
-from mortarbench.problems.models.obstacle import (
+from mortarbench.problems.families.feti_models import (
     CONTACT_RADIUS,
+    Obstacle,
     exact_energy,
     exact_height,
     obstacle_height,
@@ -22,7 +22,7 @@ TOL = 1e-11
 
 
 def solved(solver, form, dim, n):
-    case = FAMILY.build(form, {"dim": dim, "n": n}, reference_solution)
+    case = Obstacle(dim=dim, n=n).build(form, reference_solution)
     if solver is reference_solution:
         s = reference_solution(case.qp)
     else:
@@ -183,8 +183,7 @@ def test_the_exact_energy_over_the_hemisphere_is_that_of_the_exact_height():
 def test_over_the_hemisphere_the_membrane_converges_with_second_order(form):
     got = []
     for n in (16, 32, 64):
-        params = {"dim": 2, "n": n, "shape": "hemisphere"}
-        case = FAMILY.build(form, params, reference_solution)
+        case = Obstacle(n=n, shape="hemisphere").build(form, reference_solution)
         s = SMALBE().prepare(case.qp, 1e-9)()
         got.append(case.quantities(s))
 
@@ -202,7 +201,7 @@ def test_over_the_hemisphere_the_membrane_converges_with_second_order(form):
     ],
 )
 def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
-    with pytest.raises(InputError, match="obstacle: ") as e:
-        FAMILY.check({**FAMILY.defaults, **bad})
+    with pytest.raises(InputError) as e:
+        FAMILY.with_keys(**bad)
 
     assert message in str(e.value)

@@ -8,7 +8,7 @@ from mortarbench.cli.main import main
 from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.models.description import read_bodies
+from mortarbench.problems.families.description import read_bodies
 from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution

@@ -149,11 +149,11 @@ def test_unsupported_combinations_are_refused_by_name(press, name, message):
         ),
         (
             "bodies:press.toml/feti=4/dual",
-            "unknown key 'feti'; feti and parts exclude each other, .*expected parts, ",
+            "unknown key 'feti'; .*parts",
         ),
         (
             "greco/parts=4/dual",
-            "unknown key 'parts'; feti and parts exclude each other, .*expected feti, ",
+            "unknown key 'parts'; .*feti",
         ),
     ],
 )

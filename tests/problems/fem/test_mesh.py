@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mortarbench.problems.families.beam_ring import model
 from mortarbench.problems.fem.mesh import (
     half_disc,
     half_ring,
@@ -15,7 +16,6 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.fem.mesh_files.named import refine
 from mortarbench.problems.fem.mesh_files.reading import read_msh
-from mortarbench.problems.models.beam_ring import model
 from tests.support import ROOT
 
 

@@ -19,7 +19,7 @@ from mortarbench.problems.contact.stepping import forces_of, load_steps
 from mortarbench.problems.duality.case_forms import contact_case
 from mortarbench.problems.duality.monolithic import load_path as monolithic_path
 from mortarbench.problems.duality.monolithic import recovered
-from mortarbench.problems.models.beam_ring import model
+from mortarbench.problems.families.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 

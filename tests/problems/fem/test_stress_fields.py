@@ -13,10 +13,10 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.results import fields, nodal_stresses
 from mortarbench.problems.duality.monolithic import primal_qp
+from mortarbench.problems.families.beam_ring import model
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.inverse import NO_NODES
 from mortarbench.problems.fem.mesh import dofs_of
-from mortarbench.problems.models.beam_ring import model
 from tests.support.hexahedra import bricks
 
 STEEL = Material(E=2e11, nu=0.3)

@@ -8,7 +8,7 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.monolithic import primal_qp
-from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.families.patch import PRESSURE, ContactPatch, model
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,
@@ -24,7 +24,6 @@ from mortarbench.problems.fem.mesh import (
     rectangle,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover
-from mortarbench.problems.models.patch import PRESSURE, model
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from tests.support.triangles import halved, of_triangles
 
@@ -109,9 +108,9 @@ def test_energies_converge_with_the_square_of_the_size_and_stresses_with_the_siz
 
 def pressed(which, **keys):
     """Solve the contact patch test with triangles in the bodies `which`."""
-    p = {**ContactPatch().defaults, "lower": 7, "upper": 5, **keys}
-    bodies = of_triangles(model(p), np.array(which))
-    rows = linearisation(bodies, p["contact"], p["basis"])(np.zeros(bodies.mesh.dofs))
+    patch = ContactPatch(lower=7, upper=5, **keys)
+    bodies = of_triangles(model(patch), np.array(which))
+    rows = linearisation(bodies, patch.contact, patch.basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
     s = Clarabel().prepare(primal, 1e-12)()
     stress = centre_stress(bodies.mesh, bodies.D, s.x * bodies.length)

@@ -14,6 +14,8 @@ from mortarbench.harness.operators import Preconditioned
 from mortarbench.problems import OPERATORS
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.monolithic import primal_qp
+from mortarbench.problems.families.beam_ring import model
+from mortarbench.problems.families.feti_models import Membranes
 from mortarbench.problems.feti.operator_arrays import (
     dual_operator,
     dual_operator_from_arrays,
@@ -22,8 +24,6 @@ from mortarbench.problems.feti.operators import block_pseudoinverse, explicit_cl
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdomains import TornBodies
 from mortarbench.problems.feti.tearing import blocks
-from mortarbench.problems.models.beam_ring import model
-from mortarbench.problems.models.membranes import Membranes
 from tests.support.decomposed_bodies import decompose_by_labels, labelled
 
 pytestmark = pytest.mark.together
@@ -44,7 +44,7 @@ def beam_and_ring(rows="orthonormal"):
 
 
 def membranes(rows="orthonormal", size=2, cells=4):
-    return Served(TornBodies(Membranes(size, cells).in_subdomains(rows)))
+    return Served(TornBodies(Membranes(S=size, n=cells, glue=rows).in_subdomains()))
 
 
 @pytest.fixture(

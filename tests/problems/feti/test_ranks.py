@@ -49,7 +49,7 @@ def ranks_do_not_lock_one_another_out():
 def built(name, comm):
     """Build a case on ranks; return its objects on this rank, and the case."""
     case = parse(f"{name}/dual", PROBLEMS)
-    build = case.family.on_ranks(case.form, case.params)
+    build = case.family.on_ranks(case.form)
     return build(comm, reference_of_operator)
 
 
@@ -165,8 +165,8 @@ def test_the_digest_is_that_of_the_case_without_ranks(name):
 )  # fmt: skip
 def test_cases_without_subdomains_are_not_built_on_ranks(name):
     case = parse(name, PROBLEMS)
-    assert case.family.on_ranks(case.form, case.params) is None
-    assert case.family.subdomains(case.form, case.params) == 1
+    assert case.family.on_ranks(case.form) is None
+    assert case.family.subdomains(case.form) == 1
 
 
 def used(problem, size):

@@ -13,6 +13,8 @@ from mortarbench.harness import QP, Vector, no_rows
 from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.feti_dual import TornDual
+from mortarbench.problems.families.beam_ring import bodies as of_beam_ring
+from mortarbench.problems.families.feti_models import Membranes
 from mortarbench.problems.feti import spectrum as module
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.spectrum import (
@@ -23,8 +25,6 @@ from mortarbench.problems.feti.spectrum import (
     spectrum,
 )
 from mortarbench.problems.feti.subdomains import Contact, DecomposedProblem, TornBodies
-from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
-from mortarbench.problems.models.membranes import Membranes
 from tests.support.decomposed_bodies import (
     decomposed_pair,
     labelled,
@@ -171,7 +171,7 @@ def test_the_condition_is_wrong_by_the_relative_errors_of_both_eigenvalues():
 
 
 def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
-    parts = Membranes(2, 2).in_subdomains("redundant")
+    parts = Membranes(S=2, n=2, glue="redundant").in_subdomains()
     empty = no_rows(parts.contact.rows.shape[1])
     torn = TornBodies(replace(parts, contact=Contact(empty, *np.zeros((2, 0)))))
     dense = torn.rows.B.toarray()
@@ -185,7 +185,7 @@ def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
 )
 def test_eigenvalues_are_those_of_the_dense_operator(floating):
     """The space is ker G ∩ range B, or range B without a coarse problem."""
-    parts = Membranes(2, 2).in_subdomains("redundant")
+    parts = Membranes(S=2, n=2, glue="redundant").in_subdomains()
     empty = no_rows(parts.contact.rows.shape[1])
     qp, B = dual_of(replace(parts, contact=Contact(empty, *np.zeros((2, 0)))))
     if not floating:

@@ -23,11 +23,11 @@ from mortarbench.problems.experiments import QUICK, paper_experiment
 from mortarbench.problems.experiments.analysis import VARIANTS, analyse
 from mortarbench.problems.experiments.clock import Rounds, Stopwatch, race, timed_as_one
 from mortarbench.problems.experiments.physics import stepping
+from mortarbench.problems.families.beam_ring import BEAM
 from mortarbench.problems.fem.elasticity import elasticity_matrix, stiffness
 from mortarbench.problems.fem.inverse import CholeskyInverse
 from mortarbench.problems.fem.mesh import half_ring
 from mortarbench.problems.fem.triplets import stiffness_by_triplets
-from mortarbench.problems.models.beam_ring import BEAM
 from mortarbench.reports.data.evidence import Evidence, arrange, read_evidence
 from mortarbench.reports.paper.bodies import dimensions, extent
 from mortarbench.reports.paper.fleet import (
@@ -566,7 +566,7 @@ def test_damaged_data_are_named(tmp_path, file, text):
 @pytest.mark.slow
 def test_the_command_writes_all_files(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "harness", "paper", "--quick", "--out", tmp_path],
+        [sys.executable, "-m", "mortarbench", "paper", "--quick", "--out", tmp_path],
         capture_output=True, text=True, timeout=1200, check=True,
     )  # fmt: skip
 

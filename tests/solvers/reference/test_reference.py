@@ -18,7 +18,6 @@ from mortarbench.harness.conformance.manufactured import (
     one_of_each,
     unbounded,
 )
-from mortarbench.harness.names import completed
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.equilibrate import equilibrate
@@ -234,7 +233,7 @@ def test_all_forms_of_a_contact_problem_have_one_energy(name, params, forms, rel
     """
     family, energies = PROBLEMS[name], []
     for form in forms:
-        case = family.build(form, completed(family, params), reference_solution)
+        case = family.with_keys(**params).build(form, reference_solution)
         s = reference_solution(case.qp)
         energies.append(float(case.scale * objective(case.qp, s.x) + case.constant))
 
@@ -258,7 +257,7 @@ def test_all_forms_of_a_contact_problem_have_one_energy(name, params, forms, rel
 )
 def test_energies_known_by_hand_are_reached(name, params, form, energy):
     family = PROBLEMS[name]
-    case = family.build(form, completed(family, params), reference_solution)
+    case = family.with_keys(**params).build(form, reference_solution)
     s = reference_solution(case.qp)
 
     assert case.scale * case.qp.objective(s.x) + case.constant == pytest.approx(
@@ -277,8 +276,8 @@ def test_the_beam_deflects_as_in_an_independent_prototype(form, steps, tip, forc
     one step or in ten.
     """
     family = PROBLEMS["beam-ring"]
-    params = completed(family, dict(Nr=20, Nh=10, steps=steps))
-    case = family.build(form, params, reference_solution)
+    configured = family.with_keys(Nr=20, Nh=10, steps=steps)
+    case = configured.build(form, reference_solution)
     s = reference_solution(case.qp)
     quantities = case.quantities(s)
 

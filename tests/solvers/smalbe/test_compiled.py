@@ -61,8 +61,8 @@ def random_qp(seed, kind="dense"):
 @pytest.fixture(scope="module", params=["dual", "dual-bounds"])
 def contact(request):
     family = PROBLEMS["beam-ring"]
-    params = family.complete(dict(Nr=4, Nh=3))
-    return family.build(request.param, params, reference_solution).qp
+    configured = family.with_keys(Nr=4, Nh=3)
+    return configured.build(request.param, reference_solution).qp
 
 
 @pytest.mark.parametrize("seed", seeds(5, 20))

@@ -129,8 +129,8 @@ def test_structural_preconditioners_are_declined_without_structure(gap, kind):
 @pytest.mark.parametrize("kind", ["dirichlet", "lumped", "diagonal"])
 def test_preconditioned_solves_converge_and_applications_are_counted(form, kind):
     family = PROBLEMS["beam-ring"]
-    params = family.complete(dict(Nr=4, Nh=3))
-    qp = family.build(form, params, reference_solution).qp
+    configured = family.with_keys(Nr=4, Nh=3)
+    qp = configured.build(form, reference_solution).qp
     s = SMALBE(preconditioner=kind, **BETWEEN).prepare(qp, 1e-8)()
 
     assert s.status is Status.SOLVED
@@ -151,8 +151,8 @@ def test_structure_survives_the_file(gap, tmp_path):
 def test_the_matrix_of_a_dual_agrees_with_its_structure(form):
     """P = BK⁺Bᵀ on self-equilibrated λ, for any generalised inverse."""
     family = PROBLEMS["beam-ring"]
-    params = family.complete(dict(Nr=4, Nh=3))
-    qp = family.build(form, params, reference_solution).qp
+    configured = family.with_keys(Nr=4, Nh=3)
+    qp = configured.build(form, reference_solution).qp
     K, B = qp.structure.K.toarray(), qp.structure.B.toarray()
     free = np.setdiff1d(np.arange(len(K)), qp.structure.fixed)
     F = (

@@ -518,8 +518,8 @@ def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
     and 1e-8; the stopping criterion is recomputed from the QP.
     """
     family = PROBLEMS["beam-ring"]
-    params = family.complete(dict(Nr=Nr, Nh=Nh, step=step))
-    qp = family.build("dual", params, reference_solution).qp
+    configured = family.with_keys(Nr=Nr, Nh=Nh, step=step)
+    qp = configured.build("dual", reference_solution).qp
     x_tilde = np.linalg.lstsq(qp.A, qp.b)[0]
     project = np.eye(qp.q.size) - np.linalg.pinv(qp.A) @ qp.A
     size = np.linalg.norm(project @ (qp.q + qp.P @ x_tilde))
@@ -536,8 +536,8 @@ def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
 @pytest.mark.slow
 def test_few_products_suffice_with_bounds_only():
     family = PROBLEMS["beam-ring"]
-    params = family.complete(dict(Nr=30, Nh=15, step=5))
-    qp = family.build("dual-bounds", params, reference_solution).qp
+    configured = family.with_keys(Nr=30, Nh=15, step=5)
+    qp = configured.build("dual-bounds", reference_solution).qp
     s = SMALBE().prepare(qp, 1e-8)()
 
     assert kkt_residuals(qp, s).worst <= 1e-7

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.together
 
 def case(**keys):
     family = PROBLEMS["beam-ring"]
-    return family.build("dual", family.complete(keys), reference_solution)
+    return family.with_keys(**keys).build("dual", reference_solution)
 
 
 def torn(Nr, **keys):
@@ -186,7 +186,7 @@ def test_a_solve_stalled_by_rounding_ends(jump, tol):
     """
     given = {"n": 6, "pattern": "checkerboard", "jump": jump}
     plate = PROBLEMS["plate"]
-    qp = plate.build("dual", plate.complete(given), reference_solution).qp
+    qp = plate.with_keys(**given).build("dual", reference_solution).qp
     s = SMALBE().prepare(qp, tol)()
     assert s.counts["P_products"] <= 2000
     if s.status is Status.SOLVED:
@@ -202,8 +202,8 @@ def test_rounding_along_previous_directions_is_removed(jump, tol):
     directions are stored, and then further ones. A second outer iteration takes 30.
     """
     plate = PROBLEMS["plate"]
-    given = plate.complete({"pattern": "checkerboard", "jump": jump})
-    qp = plate.build("dual", given, reference_solution).qp
+    given = plate.with_keys(pattern="checkerboard", jump=jump)
+    qp = given.build("dual", reference_solution).qp
     s = SMALBE().prepare(qp, tol)()
     assert s.status is Status.SOLVED
     assert s.counts["P_products"] <= 90

@@ -128,8 +128,8 @@ def test_the_residual_and_not_only_the_projected_gradient_is_within_the_toleranc
 @pytest.mark.parametrize("step", [1, 5, 10])
 def test_the_residual_of_a_dual_with_bounds_alone_is_within_the_tolerance(step, tol):
     family = PROBLEMS["beam-ring"]
-    params = family.complete({"Nr": 30, "Nh": 15, "step": step})
-    qp = family.build("dual-bounds", params, reference_solution).qp
+    configured = family.with_keys(Nr=30, Nh=15, step=step)
+    qp = configured.build("dual-bounds", reference_solution).qp
     s = SOLVERS["smalbe"].prepare(qp, tol)()
 
     assert relative_residual(qp, s, tol) <= tol

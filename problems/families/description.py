@@ -8,7 +8,6 @@
     contact = "nts"            # or "mortar"
     basis = "dual"             # multiplier basis of mortar; or "standard"
     steps = 10                 # load steps
-    relin = 1                  # linearisations of the contact per step
     kinematics = "linear"      # or "finite": finite strain, with Newton's method
     material = "neo-hooke"     # for finite strain; or "svk", St. Venant-Kirchhoff
     gravity = [0.0, -9.81]     # m/s²; every body then needs a density
@@ -81,14 +80,14 @@ longest side of the bounding box of the mesh, and that of units.force is the sum
 |load| over the nodes, or without loads the force at a strain of 0.1 % in the softest
 body. Bodies supported by contact alone have no form dual-bounds. If neither supports
 nor friction prevent a rigid motion along the contacts, linear kinematics require
-``steps = 1`` and ``relin = 1``. A pair that sets no friction law has the law of the
+``steps = 1``. A pair that sets no friction law has the law of the
 top-level keys friction, bound and mu, whose default is no friction. With the top-level
 key ``loading = "static"``, slip is measured from the undeformed state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -126,14 +125,10 @@ from mortarbench.problems.fem.mesh_files.named import (
     refine,
 )
 from mortarbench.problems.fem.mesh_files.reading import read_mesh_file
-from mortarbench.problems.ranges import (
-    CONTACT_STIFFNESS,
+from mortarbench.problems.keys import (
     LAW_PARAMETERS,
     LAWS,
-    MAX_STEPS,
-    METHODS,
-    PLANES,
-    SETTINGS,
+    UNSET,
     check_memory,
     physical,
 )
@@ -172,6 +167,20 @@ LENGTH_UNITS = {
 #: smallest modulus without a remark, Pa. A smaller modulus indicates a material softer
 #: than rubber, or a value that was mistakenly entered in MPa
 MIN_PLAUSIBLE_E = 1e6
+#: keys of the family that the file may also set, with their defaults
+SETTINGS: Mapping[str, Any] = {
+    "contact": "nts",
+    "basis": "dual",
+    "plane": "strain",
+    "steps": 10,
+    "friction": "none",
+    "bound": UNSET,
+    "mu": UNSET,
+    "loading": "quasi-static",
+    "kinematics": "linear",
+    "material": "neo-hooke",
+    "contact_stiffness": "none",
+}
 _KEYS = (
     "mesh",
     "length_unit",
@@ -186,7 +195,7 @@ _KEYS = (
 
 
 def read_description(path: Path) -> dict[str, Any]:
-    """Read the TOML file, and check its keys and settings.
+    """Read the TOML file, and check its keys; the family checks `SETTINGS`.
 
     Raises
     ------
@@ -204,11 +213,6 @@ def read_description(path: Path) -> dict[str, Any]:
         unit = checked.text("length_unit", table.get("length_unit", "m"))
         if unit not in LENGTH_UNITS:
             raise unknown("length_unit", unit, LENGTH_UNITS)
-        for key in ("steps", "relin"):
-            default = SETTINGS[key].default
-            checked.at_least_one(key, table.get(key, default), MAX_STEPS)
-        choices = (*METHODS, *PLANES, "kinematics", "material", *CONTACT_STIFFNESS)
-        _check_choices(table, choices)
         for entry in checked.filled_list("contacts", table["contacts"]):
             checked.table("contacts", entry)
         _check_friction_values(table)
@@ -239,7 +243,8 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
             "halvings=0, and a finer mesh file"
         )
     refined = 2 * len(named.cells) * 4**halvings  # checked before refining
-    check_memory(str(path), refined if named.dim == 2 else named.points.size)
+    with located(str(path)):
+        check_memory(refined if named.dim == 2 else named.points.size)
     for _ in range(halvings):
         named = refine(named)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
@@ -515,26 +520,22 @@ def _check_loads_act(
             )
 
 
-def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Raise InputError if a value is not allowed for the case key of the same name."""
-    for key in keys:
-        allowed = SETTINGS[key].values
-        if key in entry and checked.text(key, entry[key]) not in allowed:
-            raise unknown(f"value of {key}", entry[key], map(str, allowed))
-
-
 def _check_friction_values(entry: Mapping[str, Any]) -> None:
     """Raise InputError if a friction key of an entry has an invalid value."""
-    _check_choices(entry, ("friction", "loading"))
+    law = entry.get("friction", "none")
+    if checked.text("friction", law) not in LAWS:
+        raise unknown("value of friction", law, LAWS)
     for key, what in LAW_PARAMETERS.items():
         if key in entry and physical(key, entry[key]) < 0:
             raise InputError(f"{key} = {shown(entry[key])}; expected {what}")
 
 
 def pair_laws(
-    contacts: Sequence[Mapping[str, Any]], params: Mapping[str, Any]
+    contacts: Sequence[Mapping[str, Any]], general: Mapping[str, Any]
 ) -> tuple[FrictionLaw, ...]:
-    """Return the friction law of each pair, from its entry or from the case keys.
+    """Return the friction law of each pair, from its entry or from `general`.
+
+    general : keys `friction`, `bound` and `mu` of all pairs without their own
 
     Raises
     ------
@@ -544,25 +545,21 @@ def pair_laws(
 
     """
     return tuple(
-        _each({"contacts": list(contacts)}, "contacts", lambda e: _law(e, params))
+        _each({"contacts": list(contacts)}, "contacts", lambda e: _law(e, general))
     )
 
 
-def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
+def _law(entry: Mapping[str, Any], general: Mapping[str, Any]) -> FrictionLaw:
     _check_friction_values(entry)
-    law = entry.get("friction", params["friction"])
+    law = entry.get("friction", general["friction"])
     needed = LAWS[law]
     for key in LAW_PARAMETERS:
         if key in entry and key != needed:
             raise InputError(f"{key} is not used by friction {law!r}; expected none")
-    keys = {"friction": law, "bound": 0.0, "mu": 0.0}
-    if needed:
-        keys[needed] = entry.get(needed, params[needed])
-        if keys[needed] < 0:
-            raise InputError(
-                f"friction {law!r} needs {needed}, {LAW_PARAMETERS[needed]}"
-            )
-    return law_of(keys)
+    values = {key: entry.get(key, general[key]) for key in LAW_PARAMETERS}
+    if needed and values[needed] < 0:
+        raise InputError(f"friction {law!r} needs {needed}, {LAW_PARAMETERS[needed]}")
+    return law_of(law, **values)
 
 
 def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:

@@ -25,9 +25,8 @@ the prescribed δ is π/4·(2 − ν)Q, the displacement of a rigid disc that st
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,21 +36,33 @@ from mortarbench.harness import (
     Case,
     ContactSide,
     Discs,
+    Family,
     Fields,
+    InputError,
     Reference,
     Solution,
-    Value,
     Vector,
     no_rows,
 )
+from mortarbench.harness.keys import Range
+from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
 from mortarbench.harness.operators import assembled
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
-from mortarbench.problems.models.half_space.influence import influence_operator
-from mortarbench.problems.models.half_space.point_contact import (
+from mortarbench.problems.families.half_space.influence import influence_operator
+from mortarbench.problems.families.half_space.point_contact import (
     PointContact,
     ShearedPointContact,
 )
-from mortarbench.problems.models.half_space.rough_surface import rough_surface
+from mortarbench.problems.families.half_space.rough_surface import rough_surface
+from mortarbench.problems.keys import (
+    MAX_SIZE,
+    MIN_SIZE,
+    POSITIVE,
+    UNSET,
+    Bound,
+    Law,
+    refuse_unused,
+)
 
 CONTACT_SHARE = 0.9  #: ratio of Hertz's contact radius to the half width of the grid
 #: ratio of Hertz's contact radius to the half width of the grid for rough spheres,
@@ -65,6 +76,128 @@ RADIUS = 8e-3  #: radius of each sphere, m
 #: force P, N; the peak pressure is 2.5 GPa for nu = 0.3, as in steel bearings
 LOAD = 100.0
 _CURVE_POINTS = 601  #: number of points for plots of exact tractions
+#: bytes per cell of the grid, for vectors and for Fourier transforms on four times as
+#: many cells
+_CELL_BYTES = 600
+#: largest number of cells per side for which the reference solver solves the normal
+#: problem; the solve takes 6 s of processor time with 48 cells, and 31 s with 64
+MAX_SOLVED = 48
+#: smallest number of cells per side of a rough surface; the shortest wavelength is 1/32
+#: of the side
+MIN_ROUGH = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class HalfSpace(Family):
+    """Point contact without a mesh: Hertz, rough spheres, and friction on discs."""
+
+    forms: ClassVar = ("dual",)
+
+    n: Annotated[int, Range(4, 8192), "cells along each side of the grid"] = 64
+    law: Annotated[
+        Literal["hertz", "mindlin", "rough"], "smooth, sheared or rough spheres"
+    ] = "hertz"
+    nu: Annotated[float, Range(0, 0.5), "Poisson's ratio"] = 0.3
+    Q: Annotated[float, "tangential force, a fraction of the limit of friction"] = 0.5
+    mu: Annotated[float, POSITIVE, "coefficient of friction"] = 0.3
+    seed: Annotated[int, Range(0), "seed of the rough surface"] = 0
+    hurst: Annotated[float, Range(0, 1), "Hurst exponent of the rough surface"] = 0.8
+    roughness: Annotated[
+        float, Range(0, 1), "height of the roughness, relative to the approach"
+    ] = 0.05
+    friction: Law = "none"
+    bound: Bound = UNSET
+
+    def __post_init__(self) -> None:
+        """Check that the law uses every key, and that the grid fits into memory."""
+        super().__post_init__()
+        if not 0 < self.Q < 1:
+            raise InputError(
+                f"Q={self.Q} must be between 0 and 1, a fraction of the limit of "
+                "friction"
+            )
+        self._check_law()
+        needed, limit = _CELL_BYTES * self.n**2 / 2**20, case_limit_mib()
+        if needed > limit:
+            raise InputError(
+                f"a grid of {self.n} × {self.n} cells takes {needed:.2g} MiB of "
+                f"memory; expected a grid that fits into {limit:.0f} MiB, or "
+                f"{CASE_VARIABLE} set to the memory available"
+            )
+
+    def _check_law(self) -> None:
+        """Raise InputError if law, friction and their parameters are incompatible."""
+        law, friction = self.law, self.friction
+        if law == "mindlin":
+            refuse_unused(
+                self,
+                "friction",
+                "law=mindlin, Coulomb's law with the exact pressure",
+                "law=hertz",
+            )
+        if law == "rough" and friction != "none":
+            raise InputError(
+                f"friction={friction} with law=rough is not built; expected no "
+                "friction, or law=hertz"
+            )
+        if law == "rough" and self.n < MIN_ROUGH:
+            raise InputError(
+                f"n={self.n} must be at least {MIN_ROUGH} for law=rough, two cells per "
+                "shortest wavelength"
+            )
+        coulomb = law == "mindlin" or friction == "coulomb"
+        users = {
+            "seed hurst roughness": (law == "rough", "law=rough"),
+            "Q": (coulomb or friction == "tresca", "law=mindlin or friction=coulomb"),
+            "mu": (coulomb, "law=mindlin or friction=coulomb"),
+            "bound": (friction == "tresca", "friction=tresca"),
+        }
+        for keys, (is_used, user) in users.items():
+            for key in keys.split():
+                if not is_used:
+                    refuse_unused(
+                        self, key, f"law={law} with friction={friction}", user
+                    )
+        if friction == "tresca" and self.bound not in POSITIVE:
+            given = "" if self.bound == UNSET else f", got {self.bound:g}"
+            raise InputError(
+                f"friction=tresca needs bound, a traction between {MIN_SIZE:g} and "
+                f"{MAX_SIZE:g} Pa{given}"
+            )
+        if friction == "coulomb" and self.n > MAX_SOLVED:
+            raise InputError(
+                f"friction=coulomb with n={self.n} is not built: its normal problem "
+                f"would need a full matrix; expected n={MAX_SOLVED} or less, or "
+                "law=mindlin"
+            )
+
+    def build(self, form: str, reference: Reference) -> Case:
+        """Return the case, in form dual."""
+        exact = PointContact(LOAD, RADIUS / 2, YOUNG / (2 * (1 - self.nu**2)))
+        is_rough = self.law == "rough"
+        cells = Cells(
+            self.n,
+            np.argwhere(np.ones((self.n, self.n), dtype=bool)),
+            ROUGH_SHARE if is_rough else CONTACT_SHARE,
+        )
+        pressed = cells[cells.r < 1]
+        if self.law == "mindlin":
+            return _tangential_case(
+                pressed, _coulomb(_hertz_forces(pressed, exact), exact, self)
+            )
+        if self.friction == "tresca":
+            return _tangential_case(pressed, _tresca(pressed, exact, self))
+        gap = 0.75 * np.pi * (cells.r**2 / 2 - 1)
+        if is_rough:
+            x = (np.arange(self.n) + 0.5) / self.n
+            heights = rough_surface(x, self.hurst, self.seed)
+            gap -= 0.75 * np.pi * self.roughness * heights.ravel()
+        qp = _normal_qp(cells, gap)
+        if self.friction == "none":
+            return _normal_case(qp, cells, exact, is_rough=is_rough)
+        normal = reference(replace(qp, P=assembled(qp.P))).x
+        closed = normal > ACTIVE_THRESHOLD * normal.max()
+        return _tangential_case(cells[closed], _coulomb(normal[closed], exact, self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,36 +230,6 @@ class Cells:
     def radius_of(self, count: int) -> float:
         """Return the radius of a disc with the area of `count` cells."""
         return float(self.h * np.sqrt(count / np.pi))
-
-
-def half_space_case(params: Mapping[str, Value], reference: Reference) -> Case:
-    """Return the case, in form dual, for `params`, which must contain all keys."""
-    p: Any = params
-    exact = PointContact(LOAD, RADIUS / 2, YOUNG / (2 * (1 - p["nu"] ** 2)))
-    is_rough = p["law"] == "rough"
-    cells = Cells(
-        p["n"],
-        np.argwhere(np.ones((p["n"], p["n"]), dtype=bool)),
-        ROUGH_SHARE if is_rough else CONTACT_SHARE,
-    )
-    pressed = cells[cells.r < 1]
-    if p["law"] == "mindlin":
-        return _tangential_case(
-            pressed, _coulomb(_hertz_forces(pressed, exact), exact, p)
-        )
-    if p["friction"] == "tresca":
-        return _tangential_case(pressed, _tresca(pressed, exact, p))
-    gap = 0.75 * np.pi * (cells.r**2 / 2 - 1)
-    if is_rough:
-        x = (np.arange(p["n"]) + 0.5) / p["n"]
-        heights = rough_surface(x, p["hurst"], p["seed"])
-        gap -= 0.75 * np.pi * p["roughness"] * heights.ravel()
-    qp = _normal_qp(cells, gap)
-    if p["friction"] == "none":
-        return _normal_case(qp, cells, exact, is_rough=is_rough)
-    normal = reference(replace(qp, P=assembled(qp.P))).x
-    closed = normal > ACTIVE_THRESHOLD * normal.max()
-    return _tangential_case(cells[closed], _coulomb(normal[closed], exact, p))
 
 
 def _normal_qp(cells: Cells, gap: Vector) -> QP:
@@ -217,12 +320,12 @@ class _Loading:
     sheared: ShearedPointContact | None = None  #: exact solution; None if unknown
 
 
-def _coulomb(normal: Vector, exact: PointContact, p: Mapping[str, Any]) -> _Loading:
-    sheared = ShearedPointContact(exact, p["mu"], p["nu"], p["Q"])
-    unit = p["mu"] * exact.P
+def _coulomb(normal: Vector, exact: PointContact, p: HalfSpace) -> _Loading:
+    sheared = ShearedPointContact(exact, p.mu, p.nu, p.Q)
+    unit = p.mu * exact.P
     return _Loading(
         exact=exact,
-        nu=p["nu"],
+        nu=p.nu,
         normal=normal,
         bound=normal,
         unit=unit,
@@ -231,14 +334,14 @@ def _coulomb(normal: Vector, exact: PointContact, p: Mapping[str, Any]) -> _Load
     )
 
 
-def _tresca(cells: Cells, exact: PointContact, p: Mapping[str, Any]) -> _Loading:
+def _tresca(cells: Cells, exact: PointContact, p: HalfSpace) -> _Loading:
     return _Loading(
         exact=exact,
-        nu=p["nu"],
+        nu=p.nu,
         normal=_hertz_forces(cells, exact),
         bound=np.full(len(cells.places), cells.h**2 / np.pi),
-        delta=np.pi / 4 * (2 - p["nu"]) * p["Q"],
-        unit=p["bound"] * np.pi * exact.a**2,
+        delta=np.pi / 4 * (2 - p.nu) * p.Q,
+        unit=p.bound * np.pi * exact.a**2,
     )
 
 

@@ -1,1 +1,0 @@
-"""Models of the families: meshes, materials, loads and exact solutions."""

@@ -1,1 +1,0 @@
-"""Models of the families whose elastic bodies are always three-dimensional."""
