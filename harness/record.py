@@ -80,26 +80,26 @@ REFUTED = (
 )
 
 _Count = Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)]
-_Size = Annotated[float, Meta(ge=0)]
-_Seconds = Annotated[float, Meta(ge=0, le=1e10)]
+_Size = Annotated[float, Meta(ge=0)] | None
+_Seconds = Annotated[float, Meta(ge=0, le=1e10)] | None
 _Tolerance = Annotated[float, Meta(gt=0, le=1)]
-_Scalar = (
-    None
-    | bool
-    | Annotated[int, Meta(ge=-LARGEST_INTEGER, le=LARGEST_INTEGER)]
-    | float
-    | str
-)
+_Schema = Annotated[int, Meta(ge=SCHEMA, le=SCHEMA)]
+_Name = Annotated[str, Meta(min_length=1)]
+_Mode = Annotated[str, Meta(pattern="^(cold|sequence)$")]
+_Ranks = Annotated[int, Meta(ge=1, le=LARGEST_INTEGER)]
+_Integer = Annotated[int, Meta(ge=-LARGEST_INTEGER, le=LARGEST_INTEGER)]
+_Scalar = None | bool | _Integer | float | str
 if TYPE_CHECKING:
     _Nested = Any
 else:
     _Nested = _Scalar
     for _ in range(LEVELS - 1):
         _Nested = _Scalar | list[_Nested] | dict[str, _Nested]
+_Table = Mapping[str, _Nested]
 
 
-def _about(description: str) -> Meta:
-    """Return the documentation of a field, with its unit."""
+def _is(description: str) -> Meta:
+    """Return the documentation of a field, which ends with its unit."""
     return Meta(description=description)
 
 
@@ -112,135 +112,62 @@ class Record(Struct, frozen=True, kw_only=True):
     journal, the tables and the reference page use them.
     """
 
-    schema: Annotated[
-        int, Meta(ge=SCHEMA, le=SCHEMA), _about("version of the line")
-    ] = SCHEMA
-    run_id: Annotated[
-        str, Meta(min_length=1), _about("digest of the task, equal in every such run")
-    ]
-    case: Annotated[str, _about("canonical name of the case")]
-    family: Annotated[str, _about("family of the case")]
-    params: Annotated[Mapping[str, _Scalar], _about("values of all keys of the case")]
-    form: Annotated[str, _about("form of the QP: primal, dual or dual-bounds")]
-    sizes: Annotated[
-        Mapping[str, _Count], _about("numbers of unknowns and constraints")
-    ]
-    solver: Annotated[str, _about("label of the solver in the suite")]
-    method: Annotated[str, _about("name of the solver in the registry")] = ""
-    options: Annotated[
-        Mapping[str, _Nested], _about("all options of the solver, including defaults")
-    ]
-    tol: Annotated[_Tolerance, _about("tolerance")]
-    repeat: Annotated[_Count, _about("number of the repeat, from 0")]
-    block: Annotated[
-        _Count, _about("number of the block, whose measurements ran consecutively")
-    ]
-    status: Annotated[Verdict, _about("verdict on the claim of the solver")]
-    claimed: Annotated[
-        str | None, _about("status claimed by the solver; null without a claim")
-    ] = None
-    message: Annotated[
-        str, _about("message of the solver, reason to decline, or end of the worker")
-    ] = ""
-    iterations: Annotated[_Count | None, _about("number of iterations")] = None
-    counts: Annotated[
-        Mapping[str, _Nested], _about("numbers of operations of the solver by name")
-    ] = {}
-    reported: Annotated[
-        Mapping[str, _Nested],
-        _about("other data from the solver, such as its own times"),
-    ] = {}
-    prepare_seconds: Annotated[_Seconds | None, _about("time of preparation, s")] = None
-    solve_seconds: Annotated[_Seconds | None, _about("time of the solve, s")] = None
-    total_seconds: Annotated[_Seconds | None, _about("prepare + solve, s")] = None
-    peak_mib: Annotated[
-        _Size | None, _about("peak resident memory of the worker, MiB")
-    ] = None
-    prepare_peak_mib: Annotated[
-        _Size | None, _about("peak resident memory during preparation, MiB")
-    ] = None
-    solve_peak_mib: Annotated[
-        _Size | None, _about("peak resident memory during the solve, MiB")
-    ] = None
-    inner: Annotated[
-        _Count, _about("number of timed solves; times are means over them")
-    ] = 1
-    untimed: Annotated[
-        _Count, _about("number of untimed solves before and between the timed ones")
-    ] = 0
-    remembered: Annotated[
-        bool | None,
-        _about("the solver reuses answers of earlier solves; null: unknown"),
-    ] = None
-    build_seconds: Annotated[
-        _Seconds | None, _about("time to build the case, where it was built, s")
-    ] = None
-    dualise_seconds: Annotated[
-        _Seconds | None, _about("part of build_seconds: factorisation and dual, s")
-    ] = None
-    recover_seconds: Annotated[
-        _Seconds | None, _about("time to compute quantities from the point, s")
-    ] = None
-    certify_seconds: Annotated[
-        _Seconds | None, _about("time to compute energy_bound, s")
-    ] = None
-    threads: Annotated[
-        _Count | None, _about("largest thread count of any library in the worker")
-    ] = None
-    cpu: Annotated[
-        _Count | None, _about("number of the CPU to which the worker was bound")
-    ] = None
-    ranks: Annotated[
-        int,
-        Meta(ge=1, le=LARGEST_INTEGER),
-        _about("number of MPI processes of the solve"),
-    ] = 1
-    mode: Annotated[
-        str,
-        Meta(pattern="^(cold|sequence)$"),
-        _about("sequence: results of earlier steps may be used; cold: a single case"),
-    ] = "cold"
-    accuracy: Annotated[
-        _Tolerance | None, _about("tolerance of the verdict if it differs from tol")
-    ] = None
-    arm: Annotated[
-        str, _about("null for the second copy of a solver in an A/A comparison")
-    ] = ""
-    primal: Annotated[
-        _Size | None, _about("primal residual, relative; see the page on verdicts")
-    ] = None
-    dual: Annotated[_Size | None, _about("dual residual, relative")] = None
-    complementarity: Annotated[
-        _Size | None, _about("complementarity residual, relative")
-    ] = None
-    gap: Annotated[_Size | None, _about("duality gap, relative")] = None
-    approximate_scale: Annotated[
-        bool, _about("P has no diagonal; the scales of the residuals are estimates")
-    ] = False
-    energy_bound: Annotated[
-        _Size | None, _about("certified bound on the relative error in energy norm")
-    ] = None
-    certificate: Annotated[
-        Mapping[str, _Nested], _about("relative components of energy_bound")
-    ] = {}
-    objective: Annotated[
-        float | None, _about("objective ½xᵀPx + qᵀx of the emitted QP at the answer")
-    ] = None
-    quantities: Annotated[
-        Mapping[str, _Nested],
-        _about("physical results by name, in metre, newton and second"),
-    ] = {}
-    qp: Annotated[
-        str | None, _about("digest of the emitted QP, which identifies the problem")
-    ] = None
-    environment: Annotated[
-        str, _about("digest of environment.json, or of a file in environments/")
-    ] = ""
-    node: Annotated[str, _about("host name of the cluster node")] = ""
-    vectors: Annotated[str | None, _about("digest of the stored solution")] = None
-    fields: Annotated[str | None, _about("digest of the stored deformed state")] = None
-    started: Annotated[str, _about("start of the measurement, UTC, ISO 8601")] = ""
-    session: Annotated[str, _about("id of the run command")] = ""
+    schema: Annotated[_Schema, _is("version of the meaning of the fields")] = SCHEMA
+    run_id: Annotated[_Name, _is("digest of the task, equal in all runs of a suite")]
+    case: Annotated[str, _is("canonical name")]
+    family: Annotated[str, _is("family of the case")]
+    params: Annotated[Mapping[str, _Scalar], _is("values of all keys of the case")]
+    form: Annotated[str, _is("form of the QP")]
+    sizes: Annotated[Mapping[str, _Count], _is("sizes of the QP")]
+    solver: Annotated[str, _is("label of the solver in the suite")]
+    method: Annotated[str, _is("name of the solver in the registry")] = ""
+    options: Annotated[_Table, _is("all options of the solver, with defaults")]
+    tol: Annotated[_Tolerance, _is("tolerance passed to the solver")]
+    repeat: Annotated[_Count, _is("number of the repeat, from 0")]
+    block: Annotated[_Count, _is("number of the block of consecutive measurements")]
+    status: Annotated[Verdict, _is("verdict on the claim of the solver")]
+    claimed: Annotated[str | None, _is("status that the solver claims")] = None
+    message: Annotated[str, _is("message of the solver, or why it has no answer")] = ""
+    iterations: Annotated[_Count | None, _is("number of iterations")] = None
+    counts: Annotated[_Table, _is("numbers of operations by name")] = {}
+    reported: Annotated[_Table, _is("further data from the solver")] = {}
+    prepare_seconds: Annotated[_Seconds, _is("conversion and factorisation, s")] = None
+    solve_seconds: Annotated[_Seconds, _is("solve, s")] = None
+    total_seconds: Annotated[_Seconds, _is("prepare + solve, s")] = None
+    peak_mib: Annotated[_Size, _is("peak resident memory of the worker, MiB")] = None
+    prepare_peak_mib: Annotated[_Size, _is("the same in the preparation, MiB")] = None
+    solve_peak_mib: Annotated[_Size, _is("the same in the solve, MiB")] = None
+    inner: Annotated[_Count, _is("timed solves, over which times are means")] = 1
+    untimed: Annotated[_Count, _is("solves before and between the timed ones")] = 0
+    remembered: Annotated[bool | None, _is("the solver reuses earlier answers")] = None
+    build_seconds: Annotated[_Seconds, _is("building of the case, s")] = None
+    dualise_seconds: Annotated[_Seconds, _is("part of build: dual QP, s")] = None
+    recover_seconds: Annotated[_Seconds, _is("quantities from the point, s")] = None
+    certify_seconds: Annotated[_Seconds, _is("bound on the error, s")] = None
+    threads: Annotated[_Count | None, _is("most threads of a library")] = None
+    cpu: Annotated[_Count | None, _is("number of the CPU of the worker")] = None
+    ranks: Annotated[_Ranks, _is("number of MPI processes of the solve")] = 1
+    mode: Annotated[_Mode, _is("sequence: earlier steps may be reused")] = "cold"
+    accuracy: Annotated[_Tolerance | None, _is("tolerance of the verdict, or tol")] = (
+        None
+    )
+    arm: Annotated[str, _is("null: second copy of a solver in an A/A test")] = ""
+    primal: Annotated[_Size, _is("primal residual, relative")] = None
+    dual: Annotated[_Size, _is("dual residual, relative")] = None
+    complementarity: Annotated[_Size, _is("complementarity residual, relative")] = None
+    gap: Annotated[_Size, _is("duality gap, relative")] = None
+    approximate_scale: Annotated[bool, _is("scales of residuals are estimates")] = False
+    energy_bound: Annotated[_Size, _is("certified relative error in energy")] = None
+    certificate: Annotated[_Table, _is("components of energy_bound, relative")] = {}
+    objective: Annotated[float | None, _is("½xᵀPx + qᵀx of the emitted QP")] = None
+    quantities: Annotated[_Table, _is("physical results by name; m, N and s")] = {}
+    qp: Annotated[str | None, _is("digest of the emitted QP")] = None
+    environment: Annotated[str, _is("digest of the file of the environment")] = ""
+    node: Annotated[str, _is("host name of the cluster node")] = ""
+    vectors: Annotated[str | None, _is("digest of the stored solution")] = None
+    fields: Annotated[str | None, _is("digest of the stored deformed state")] = None
+    started: Annotated[str, _is("start of the measurement, UTC, ISO 8601")] = ""
+    session: Annotated[str, _is("id of the run command")] = ""
 
     @property
     def identity(self) -> str:
@@ -292,9 +219,8 @@ class Record(Struct, frozen=True, kw_only=True):
         if shared is not None:
             for name in _REPEATED:
                 value = getattr(record, name)
-                structs.force_setattr(
-                    record, name, shared.setdefault(repr(value), value)
-                )
+                value = shared.setdefault(repr(value), value)
+                structs.force_setattr(record, name, value)
         return record
 
 

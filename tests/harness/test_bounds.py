@@ -84,7 +84,7 @@ def refused(capsys, monkeypatch, tmp_path):
         ({"status": "fine"}, "'fine'; expected one of verified, verified_infeasible"),
         ({"params": {"n": [1]}}, "params[...]: Expected `bool | int | float"),
         ({"run_id": ""}, "run_id: Expected `str` of length >= 1"),
-        ({"options": {"x": [[[[[1]]]]]}}, "options[...][0][0][0]: Expected `bool"),
+        ({"options": {"x": [[[[[[[[[1]]]]]]]]]}}, "[0][0][0]: Expected `bool"),
         ({"message": 10**5000 // 7 % 10**300}, "message: Expected `str`"),
     ],
 )
@@ -111,6 +111,15 @@ def test_numbers_that_readers_refuse_are_written_as_null():
 
     assert row["counts"] == {"n": None}
     assert row["gap"] is None
+
+
+def test_tables_of_any_depth_are_written_so_that_they_can_be_read():
+    deep = [1, "\ud800"]
+    for _ in range(30):
+        deep = {"a": deep}
+
+    line = record(quantities={"b": deep, "c": [float("nan")]}).to_json()
+    assert Record.from_json(line).quantities["c"] == [None]
 
 
 def test_extreme_values_that_are_possible_are_read_as_they_are(journal):

@@ -10,6 +10,7 @@ import markdown
 import pytest
 import yaml
 
+from mortarbench.harness.record import Record
 from tests.support import ROOT
 
 sys.path.append(str(ROOT / "tools" / "site"))
@@ -112,3 +113,12 @@ def test_letters_and_signs_of_a_formula_are_those_of_its_source():
     text = "".join(ElementTree.fromstring(formula).itertext())
 
     assert unicodedata.normalize("NFKC", text) == "12uˆTKu−f∗≤10−8"
+
+
+def test_the_page_of_records_has_a_row_with_a_range_for_each_field():
+    text = pages.record_page()
+    rows = [line.split("|")[1:-1] for line in text.splitlines() if "`" in line[:3]]
+
+    assert [row[0].strip(" `") for row in rows] == [*Record.__struct_fields__]
+    assert all(row[3].strip() for row in rows)
+    assert "| `tol` | number | > 0, ≤ 1 | tolerance passed to the solver |" in text

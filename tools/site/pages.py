@@ -50,6 +50,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, page in PAGES.items():
         text = from_root((ROOT / name).read_text("utf-8"))
         files.append(File.generated(config, page, content=text))
+    files.append(File.generated(config, "records.md", content=record_page()))
     if WEAKNESSES.is_file():
         content = WEAKNESSES.read_text("utf-8")
         files.append(File.generated(config, WEAKNESSES.name, content=content))
@@ -118,6 +119,36 @@ def from_root(text: str) -> str:
     for name, page in PAGES.items():
         text = text.replace(f"]({name}", f"]({page}")
     return text
+
+
+def record_page() -> str:
+    """Return a page with a table of the fields of a record, from their annotations."""
+    import msgspec
+
+    from mortarbench.harness.record import Record
+
+    _, parts = msgspec.json.schema_components([Record])
+    signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤"}
+    rows = []
+    for name, field in parts["Record"]["properties"].items():
+        kinds = [field, *field.get("anyOf", ())]
+        words = [kind["type"] for kind in kinds if "type" in kind] or ["string"]
+        limits = [
+            f"{sign} {kind[limit]:g}"
+            for kind in kinds
+            for limit, sign in signs.items()
+            if limit in kind and kind[limit] < 2**62
+        ]
+        cells = " or ".join(words), ", ".join(limits), field["description"]
+        rows.append(f"| `{name}` | {' | '.join(cells)} |\n")
+    return (
+        "# Fields of a record\n\n"
+        "A line of the journal is a JSON object with these fields. `results.df`, the "
+        "CSV table `measurements` and `records.parquet` have a column for each field. "
+        "A value that was not measured is null.\n\n"
+        "| field | type | range | content |\n| --- | --- | --- | --- |\n"
+        + "".join(rows)
+    )
 
 
 def help_texts() -> str:
