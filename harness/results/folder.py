@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -42,13 +43,8 @@ _LOCK = ".lock"
 _LOCK_CONTENT = b"held by runs of mortarbench\n"
 _DIGEST = re.compile(r"[\w.-]{1,64}")
 _SCRATCH = ".scratch"
-#: beginnings of the names of files in the result folder itself
-_FILE_PREFIXES = (
-    _LOCK,
-    "environment.",
-    "suite.",
-    "validation.",
-)
+#: beginnings of the names of the folders and files of a result folder
+_NAMES = (*_FOLDERS, _SCRATCH, _LOCK, "environment.", "suite.", "validation.")
 
 
 def refuse_links(folder: Path) -> None:
@@ -66,52 +62,30 @@ def refuse_links(folder: Path) -> None:
         cannot be listed; the message names the first such entry.
 
     """
-    try:
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                if entry.name in (*_FOLDERS, _SCRATCH):
-                    if not _is_plain(entry):
-                        raise _not_plain(entry.path, "a folder")
-                    if entry.is_dir(follow_symlinks=False):
-                        _only_plain(entry.path)
-                elif entry.name.startswith(_FILE_PREFIXES) and not _is_plain(entry):
-                    raise _not_plain(entry.path, "a regular file")
-    except OSError as e:
+
+    def refuse(e: OSError) -> None:
         raise InputError(
             f"{e.filename}: {e.strerror}; expected a folder that can be read"
-        ) from None
-
-
-def _only_plain(folder: str) -> None:
-    """Raise `InputError` for links, pipes, devices and too deeply nested folders."""
-    level = [folder]
-    for _ in range(MAX_FOLDER_DEPTH):
-        inner = []
-        for each in level:
-            with os.scandir(each) as entries:
-                for entry in entries:
-                    if not _is_plain(entry):
-                        raise _not_plain(entry.path, "a folder or a regular file")
-                    if entry.is_dir(follow_symlinks=False):
-                        inner.append(entry.path)
-        level = inner
-    if level:
-        raise InputError(
-            f"{folder}: folders nested deeper than {MAX_FOLDER_DEPTH} levels; "
-            "expected at most this depth; move the deeper folders away"
         )
 
-
-def _is_plain(entry: os.DirEntry[str]) -> bool:
-    is_file = entry.is_file(follow_symlinks=False)
-    return is_file or entry.is_dir(follow_symlinks=False)
-
-
-def _not_plain(path: str, expected: str) -> InputError:
-    return InputError(
-        f"{path} is a link, pipe or device; expected {expected}, as in every result "
-        "folder"
-    )
+    top = str(folder)
+    for root, inner, files in os.walk(top, onerror=refuse):
+        names, below = [*inner, *files], os.path.relpath(root, top).split(os.sep)
+        if root == top:
+            inner[:] = [name for name in inner if name in (*_FOLDERS, _SCRATCH)]
+            names = [name for name in names if name.startswith(_NAMES)]
+        for name in names:
+            mode = os.lstat(path := os.path.join(root, name)).st_mode
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise InputError(
+                    f"{path} is a link, pipe or device; expected a regular file or a "
+                    "folder, as in every result folder"
+                )
+        if inner and len(below) >= MAX_FOLDER_DEPTH:
+            raise InputError(
+                f"{folder / below[0]}: folders nested deeper than {MAX_FOLDER_DEPTH} "
+                "levels; expected at most this depth; move the deeper folders away"
+            )
 
 
 def refuse_foreign(folder: Path) -> None:
