@@ -68,7 +68,6 @@ def measure_and_write(
         If the folder is in use, or contains files that are not results of this command.
 
     """
-    from mortarbench.harness.files.experiment import save_experiment
     from mortarbench.problems.experiments import PAPER, QUICK, paper_experiment
     from mortarbench.reports.paper.report import write_paper
     from mortarbench.results import run as run_suite
@@ -82,7 +81,6 @@ def measure_and_write(
         baseline=_answer(registries, "smalbe-paper"),
         reference=registries.reference,
     )
-    save_experiment(experiment, data)
     for name, narrowed in BEYOND.items():
         say(f"Suite {name}")
         run_suite(
@@ -93,7 +91,7 @@ def measure_and_write(
             registries=registries,
             **(narrowed if quick else {}),
         )
-    return write_paper(out)
+    return write_paper(out, experiment)
 
 
 def _answer(registries: Registries, name: str) -> Reference:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from mortarbench.harness import Reference
-from mortarbench.harness.files.experiment import Experiment
+from mortarbench.harness.results.experiment import Experiment
 from mortarbench.problems.experiments.analysis import scaling, states
 from mortarbench.problems.experiments.parts import (
     Rows,

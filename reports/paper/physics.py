@@ -8,7 +8,7 @@ from math import sqrt
 
 import numpy as np
 
-from mortarbench.harness.files.experiment import Row
+from mortarbench.harness.results.experiment import Row
 from mortarbench.reports.document import figure
 from mortarbench.reports.document.figure import (
     Axis,

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from mortarbench.harness.files.experiment import Experiment, Row, load_experiment
+from mortarbench.harness.results.experiment import Experiment, Row
 from mortarbench.reports.data.evidence import Evidence, read_evidence
 from mortarbench.reports.document.fields import FieldFigure
 from mortarbench.reports.document.figure import Figure
@@ -75,19 +75,18 @@ REPEATED = (
 )
 
 
-def write_paper(folder: Path) -> list[Path]:
-    """Write index.html, figures/ (pdf, svg, png) and tables/ (csv, tex) from data/.
+def write_paper(folder: Path, experiment: Experiment) -> list[Path]:
+    """Write index.html, figures/ (pdf, svg, png) and tables/ (csv, tex).
 
-    data/ contains an experiment and, if measured, result folders of the suites of
-    `BEYOND`. Equal data yield identical bytes.
+    The folder data/ contains result folders of the suites of `BEYOND`, if measured.
+    Equal data yield identical bytes.
 
     Raises
     ------
     InputError
-        If data/ is missing or damaged.
+        If a result folder is damaged.
 
     """
-    experiment = load_experiment(folder / "data")
     suites = {
         name: read_evidence(folder / "data" / name)
         for name in BEYOND

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from mortarbench.harness import Vector
-from mortarbench.harness.files.experiment import Experiment, Row
+from mortarbench.harness.results.experiment import Experiment, Row
 from mortarbench.reports.document.figure import (
     INK,
     Area,

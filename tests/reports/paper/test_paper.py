@@ -12,12 +12,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from mortarbench.harness import InputError, Record, Verdict
-from mortarbench.harness.files.experiment import (
-    Experiment,
-    load_experiment,
-    save_experiment,
-)
+from mortarbench.harness import Record, Verdict
 from mortarbench.harness.results.journal import Journal
 from mortarbench.problems.experiments import QUICK, paper_experiment
 from mortarbench.problems.experiments.analysis import VARIANTS, analyse
@@ -79,10 +74,9 @@ def experiment():
 
 
 @pytest.fixture(scope="module")
-def data(experiment, tmp_path_factory):
-    """Return a folder that contains only measurements."""
+def data(tmp_path_factory):
+    """Return a folder that contains only measurements of suites."""
     path = tmp_path_factory.mktemp("paper") / "measured"
-    save_experiment(experiment, path / "data")
     for name, records in synthetic().items():
         with Journal(path / "data" / name, "here") as journal:
             for record in records:
@@ -91,28 +85,28 @@ def data(experiment, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def folder(data, blank):
+def folder(data, experiment, blank):
     """Return a folder with the page and its tables, with empty figures."""
     path = data.with_name("page")
     shutil.copytree(data, path)
     with blank():
-        write_paper(path)
+        write_paper(path, experiment)
     return path
 
 
 @pytest.fixture(scope="module")
-def all_formats(data):
+def all_formats(data, experiment):
     path = data.with_name("all formats")
     shutil.copytree(data, path)
-    write_paper(path)
+    write_paper(path, experiment)
     return path
 
 
 @pytest.fixture(scope="module")
-def pictures(data):
+def pictures(data, experiment):
     """Return the pictures of stored data by name, not yet drawn."""
     suites = {n: read_evidence(data / "data" / n) for n in synthetic()}
-    page = compose(load_experiment(data / "data"), suites)
+    page = compose(experiment, suites)
     return {p.name: p for s in page.sections for p in s.pictures}
 
 
@@ -197,24 +191,14 @@ def test_the_page_is_complete_and_escapes_foreign_text(folder):
 
 
 @pytest.mark.slow
-def test_all_figures_have_reproducible_bytes(all_formats, data, tmp_path):
-    """The page is drawn from the files in data/ without new measurements."""
+def test_all_figures_have_reproducible_bytes(all_formats, data, experiment, tmp_path):
     shutil.copytree(data / "data", tmp_path / "data")
-    save_experiment(load_experiment(data / "data"), tmp_path / "data")
-    again = write_paper(tmp_path)
+    again = write_paper(tmp_path, experiment)
 
     assert len(again) == 1 + 14 * 3 + 5 + 8
-    for path in [*again, *(tmp_path / "data").glob("*.csv")]:
+    for path in again:
         first = all_formats / path.relative_to(tmp_path)
         assert path.read_bytes() == first.read_bytes()
-
-
-def test_equal_data_give_equal_bytes(data, tmp_path):
-    save_experiment(load_experiment(data / "data"), tmp_path / "data")
-    stored = [*(tmp_path / "data").glob("*.csv")]
-    assert stored
-    for path in stored:
-        assert path.read_bytes() == (data / path.relative_to(tmp_path)).read_bytes()
 
 
 def test_table_1_satisfies_the_formulas_of_the_paper(experiment):
@@ -539,30 +523,6 @@ def test_a_stopwatch_sums_the_times_of_a_part(monkeypatch):
     assert watch.laps == {"a": 4.0, "b": 2.0}
 
 
-def test_an_experiment_is_read_back_exactly(tmp_path):
-    rows = [{"n": 3, "method": "a, \"b\"", "seconds": 0.1 + 0.2},
-            {"n": 4, "method": "c", "seconds": 1e-17}]  # fmt: skip
-    given = Experiment(setting={"λ": [1, None]}, tables={"t": rows}, states={})
-    save_experiment(given, tmp_path / "d")
-    got = load_experiment(tmp_path / "d")
-
-    assert got.tables == {"t": rows}
-    assert got.setting == given.setting
-
-
-@pytest.mark.parametrize(
-    ("file", "text"), [("setting.json", "{"), ("setting.json", "[]"), ("t.csv", None)]
-)
-def test_damaged_data_are_named(tmp_path, file, text):
-    given = Experiment(setting={}, tables={"t": [{"n": 1}]}, states={})
-    save_experiment(given, tmp_path)
-    path = tmp_path / file
-    path.write_text(text) if text is not None else path.unlink()
-
-    with pytest.raises(InputError, match=file):
-        load_experiment(tmp_path)
-
-
 @pytest.mark.slow
 def test_the_command_writes_all_files(tmp_path):
     done = subprocess.run(
@@ -571,5 +531,5 @@ def test_the_command_writes_all_files(tmp_path):
     )  # fmt: skip
 
     assert done.stdout == f"{tmp_path / 'index.html'}\n"
-    (beam, ring) = rows_of(tmp_path / "data" / "table1.csv")
+    (beam, ring) = rows_of(tmp_path / "tables" / "table1.csv")
     assert (beam["dofs"], ring["dofs"]) == ("14942", "11222")
