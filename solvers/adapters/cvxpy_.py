@@ -24,9 +24,12 @@ from mortarbench.harness import (
     Status,
     needs_matrices,
 )
-from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.common.adapter import Adapter
-from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
+from mortarbench.solvers.common.backends import (
+    BackendAdapter,
+    Call,
+    adapter_files,
+    reason_unavailable,
+)
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     DIVERGED,
@@ -85,7 +88,7 @@ CLAIMS = {
 
 
 @dataclass(frozen=True)
-class CVXPY(Adapter):
+class CVXPY(BackendAdapter):
     """One backend of cvxpy.
 
     The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
@@ -97,8 +100,6 @@ class CVXPY(Adapter):
     that solve linear programs only, and for ProxQP, because cvxpy cannot enable
     ProxQP's test of the duality gap.
     """
-
-    backend: str = ""  #: the NAME in cvxpy:NAME
 
     about: ClassVar[About] = About(
         title="cvxpy",
@@ -135,10 +136,6 @@ class CVXPY(Adapter):
         if self.backend == "SCS" and not has_rows:
             return "needs a row or a bound"
         return DECLINED_BACKENDS.get(self.backend) or needs_matrices(qp)
-
-    def library(self) -> Any:
-        direct: Any = SOLVERS.get(self.backend.lower())
-        return direct.library() if isinstance(direct, Adapter) else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import cvxpy

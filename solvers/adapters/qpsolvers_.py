@@ -26,9 +26,12 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
-from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.common.adapter import Adapter
-from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
+from mortarbench.solvers.common.backends import (
+    BackendAdapter,
+    Call,
+    adapter_files,
+    reason_unavailable,
+)
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
@@ -100,7 +103,7 @@ STATUS_PATTERNS = (
 
 
 @dataclass(frozen=True)
-class QPSolvers(Adapter):
+class QPSolvers(BackendAdapter):
     """One backend of qpsolvers.
 
     The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
@@ -110,8 +113,6 @@ class QPSolvers(Adapter):
     ‖q‖∞ = 1 if the backend's test is absolute (highs, daqp). Backends that accept both
     dense and sparse matrices receive dense matrices if P is dense.
     """
-
-    backend: str = ""  #: the NAME in qpsolvers:NAME
 
     about: ClassVar[About] = About(
         title="qpsolvers",
@@ -154,10 +155,6 @@ class QPSolvers(Adapter):
             return reason
         dense_only = self.backend in DENSE_BACKENDS
         return needs_dense(qp, 4) if dense_only else needs_matrices(qp)
-
-    def library(self) -> Any:
-        direct: Any = SOLVERS.get(self.backend)
-        return direct.library() if isinstance(direct, Adapter) else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         if self.backend not in NEEDS_FIXED_IN_ROWS:

@@ -16,6 +16,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.common.adapter import Adapter
 from mortarbench.solvers.common.conversion import OBJECTIVE_SIZE
 
 
@@ -34,6 +36,18 @@ class Call:
         """Return all keyword arguments of the backend for the tolerance `tol`."""
         value = max(self.tighter * tol, self.floor)
         return {**dict.fromkeys(self.tolerances, value), **self.fixed}
+
+
+@dataclass(frozen=True)
+class BackendAdapter(Adapter):
+    """Adapter of a library that calls other libraries."""
+
+    backend: str = ""  #: name of the backend, after the colon in the solver's name
+
+    def library(self) -> Any:
+        """Return the settings that the backend's own adapter lists, or None."""
+        direct: Any = SOLVERS.get(self.backend.lower())
+        return direct.library() if isinstance(direct, Adapter) else None
 
 
 def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:
