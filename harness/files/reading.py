@@ -8,7 +8,6 @@ raise an `InputError` that states where the error is and what was expected.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import stat
@@ -16,9 +15,10 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from math import isinf
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO
+
+import msgspec
 
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import FULL
@@ -129,18 +129,11 @@ def read_json(path: Path, expected: str = "a JSON file") -> Any:
     """Read and parse a JSON file; `expected` describes it in messages."""
     text = read_text(path, expected, MAX_JSON_MIB)
     try:
-        data = json.loads(
-            text, parse_constant=_no_constant, parse_int=_integer, parse_float=_number
-        )
+        data = msgspec.json.decode(text)
         _refuse_deep(data)
-    except json.JSONDecodeError as e:
-        raise InputError(
-            f"{path}: malformed: {e.msg} at line {e.lineno}, column {e.colno}; "
-            f"expected {expected}"
-        ) from None
     except RecursionError:
         raise InputError(f"{path}: {_too_deep()}") from None
-    except ValueError as e:
+    except msgspec.DecodeError as e:
         raise InputError(f"{path}: malformed: {e}; expected {expected}") from None
     return data
 
@@ -162,21 +155,6 @@ def _refuse_deep(data: object) -> None:
 
 def _too_deep() -> InputError:
     return InputError(f"nested too deeply; expected at most {MAX_LEVELS} levels")
-
-
-def _no_constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a number in JSON")
-
-
-def _integer(text: str) -> int:
-    _number(text)
-    return int(text)
-
-
-def _number(text: str) -> float:
-    if isinf(value := float(text)):
-        raise ValueError(f"{text[:20]}… is beyond the range of a double")
-    return value
 
 
 def _limit(most: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -70,13 +71,15 @@ def rebuild(
         If the family is unknown or raises an exception.
 
     """
-    if r.family not in families:
-        try:
-            needs = plugins_needed(environment_of(folder, r.environment))
-        except InputError:
-            needs = ""
-        raise InputError(f"unknown family {r.family!r}{needs}")
     try:
-        return case_of(r, families).build(reference)
+        name = case_of(r, families)
+    except InputError as e:
+        with suppress(InputError):
+            e = InputError(
+                f"{e}{plugins_needed(environment_of(folder, r.environment))}"
+            )
+        raise e from None
+    try:
+        return name.build(reference)
     except (Exception, SystemExit) as e:  # raised by code of the family
         raise InputError(unbuilt(r.case, e)) from None
