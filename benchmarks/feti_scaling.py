@@ -113,7 +113,7 @@ def one(way, family, size, cells):
         primal=primal, to_primal=dual.recover,
         factorise=lambda: factorise_clamped(bodies),
         subdomains=subdomains,
-        mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
+        rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip
     bound = certify(mechanics, back).bound
     lap()

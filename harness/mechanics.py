@@ -624,10 +624,8 @@ class Mechanics:
     factorise: Callable[
         [], Inverse
     ]  #: factorises K and returns K⁺; called on first access to `inverse`
-    #: cell size of the contact side, in the unit of length of `primal`
-    mesh_size: float
-    #: (n, r) rigid motions of each body, regardless of supports, for checks of
-    #: equilibrium
+    #: (n, r) rigid motions of each body, regardless of supports, for messages on loads
+    #: that are not in equilibrium
     rigid: NDArray[np.float64]
     #: names of the bodies, in the order of their columns in `rigid`
     names: tuple[str, ...] = ()

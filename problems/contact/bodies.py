@@ -12,7 +12,6 @@ from scipy.linalg import block_diag, null_space
 from scipy.sparse import csc_array, csr_array, eye_array, vstack
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.contact.rigid import RigidBody
 from mortarbench.problems.fem.elasticity import (
     Material,
@@ -191,20 +190,6 @@ class UnassembledBodies:
         """Nodes of each piece, (N_p, dim)."""
         ends = np.cumsum(np.bincount(self.piece_of_node))
         return np.split(self.mesh.points, ends[:-1])
-
-    @property
-    def mesh_size(self) -> float:
-        """Mean distance of consecutive nodes of the slave sides, divided by `length`.
-
-        Without contact pairs, the mean is taken over the whole boundary.
-        """
-        mesh, chains = self.mesh, [pair.slave for pair in self.pairs]
-        if not chains or mesh.dim > 2:  # consecutive nodes of each facet
-            chains = chains or [boundary_facets(mesh.cells, mesh.dim)]
-            chains = [facet for facets in chains for facet in facets]
-        sides = [mesh.points[chain] for chain in chains]
-        steps = [np.linalg.norm(np.diff(side, axis=0), axis=1) for side in sides]
-        return float(np.concatenate(steps).mean() / self.length)
 
     @property
     def D(self) -> NDArray[np.float64]:

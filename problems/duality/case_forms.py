@@ -200,7 +200,6 @@ def contact_case(
             primal=primal,
             to_primal=to_primal,
             factorise=supported,
-            mesh_size=bodies.mesh_size,
             rigid=bodies.rigid,
             names=bodies.piece_names,
             scale=energy,

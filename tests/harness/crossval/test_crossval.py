@@ -251,7 +251,7 @@ def duplicate():
         lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
     )  # fmt: skip
     mechanics = Mechanics(
-        primal=primal, to_primal=lambda s: s, factorise=lambda: Dense(K), mesh_size=1.0,
+        primal=primal, to_primal=lambda s: s, factorise=lambda: Dense(K),
         rigid=np.zeros((2, 0)),
     )  # fmt: skip
     return Case(qp=primal, recover=lambda s: s.x, quantities=lambda s: {},

@@ -252,10 +252,9 @@ def test_interference_is_a_load(column):
     """A column between two fixed ends that is 1 mm too long."""
     more = BASE + '[[supports]]\nboundary = "top"\nfix = ["y"]\n'
     for form in ("primal", "dual", "dual-bounds"):
-        case, _, values = column(more, form, gap=-0.001)
+        *_, values = column(more, form, gap=-0.001)
         (pair,) = values["contacts"].values()
         assert pair["largest_pressure"] == pytest.approx(M * 0.001 / 4, rel=1e-8)
-        assert case.mechanics.mesh_size > 0
     with pytest.raises(InputError, match="nothing stresses the bodies"):
         column(more)
 
