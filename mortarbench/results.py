@@ -39,9 +39,6 @@ if TYPE_CHECKING:
     from mortarbench.harness.running.run import Missing
 
 
-#: verdicts that refute the solver's claim
-
-
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Results:
     """Measurements of a result folder."""

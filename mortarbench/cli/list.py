@@ -11,14 +11,14 @@ from mortarbench.registries import Plugins, Registries
 
 def list_(
     registries: Registries,
-    what: Literal["problems", "solvers", "suites"],
+    kind: Literal["problems", "solvers", "suites"],
     *,
     plugins: Plugins = (),
     json: bool = False,
 ) -> int:
     """List the available problems, solvers or suites.
 
-    what : what to list
+    kind : what to list
     plugins : Python files with more solvers or families
     json : print JSON
     """
@@ -27,6 +27,6 @@ def list_(
         "solvers": listing.solvers,
         "suites": listing.suites,
     }
-    rows = functions[what](registries=registries)
+    rows = functions[kind](registries=registries)
     print(dumps(list(rows)) if json else rows)
     return 0

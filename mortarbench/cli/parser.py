@@ -20,7 +20,7 @@ from itertools import takewhile
 from math import isfinite
 from typing import Annotated, Any, Literal, NoReturn, get_args, get_origin
 
-from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import InputError, unknown
 
 _ENTRY = re.compile(r"\*?(\w+(?:, \w+)*) : (.+)")  #: names of parameters, and a text
 _PARAMETERS = re.compile(rf"\n\n(?:Parameters\n|{_ENTRY.pattern})")  #: their beginning
@@ -57,6 +57,12 @@ class Parser(argparse.ArgumentParser):
                         f"{text}: -- is not a value; expected {name}=VALUE"
                     )
         return super().parse_known_args(args, namespace)
+
+    def _check_value(self, action: argparse.Action, value: object) -> None:
+        """Suggest the most similar choice, which argparse does not before 3.14."""
+        if action.choices is not None and value not in action.choices:
+            what = action.metavar if isinstance(action.metavar, str) else action.dest
+            self.error(str(unknown(what.lower(), str(value), action.choices)))
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Exit after a help text has been printed."""

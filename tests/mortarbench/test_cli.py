@@ -469,8 +469,11 @@ def test_an_internal_error_exits_with_3_and_a_traceback(cli):
 SOLVE = ("solve", "well/primal", "--solver", "exact")
 WRONG = {
     "no command": ((), "the following arguments are required: COMMAND; usage: morta"),
-    "unknown command": (("rnu",), "'rnu' (choose from"),
-    "unknown list": (("list", "sovlers"), "'sovlers' (choose from"),
+    "unknown command": (("rnu",), "unknown command 'rnu'; did you mean 'run'? known: "),
+    "unknown list": (
+        ("list", "sovlers"),
+        "unknown kind 'sovlers'; did you mean 'solvers'? ",
+    ),
     "unknown option": (
         ("run", "tiny", "--repeat", "3"),
         "unknown argument '--repeat'; did you mean --repeats? usage: mortarbench run ",

@@ -95,7 +95,7 @@ def test_help_texts_are_the_first_sentences_of_the_docstring(parser):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("pie tea", "invalid choice: 'tea'"),
+        ("pie tea", "unknown kind 'tea'; known: cake, soup; usage: cook"),
         ("pie", "required: kind"),
         ("pie cake --heat x", "argument --heat: invalid float value: 'x'"),
         ("pie cake --haet 3", "unknown argument '--haet'; did you mean --heat?"),

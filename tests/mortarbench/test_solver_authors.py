@@ -272,7 +272,7 @@ def test_existing_files_are_not_overwritten(starting, tmp_path, kind):
         (("solver", "../b"), "name '../b'; expected letters"),
         (("solver", ""), "name ''; expected letters"),
         (("solver", "7b"), "name '7b'; expected letters, digits, '-' and '_', start"),
-        (("familie", "b"), "argument kind: invalid choice: 'familie' (choose from"),
+        (("familie", "b"), "unknown kind 'familie'; known: problem, solver, suite"),
     ],
 )
 def test_an_invalid_name_is_refused(starting, tmp_path, words, message):
