@@ -11,7 +11,6 @@ from contextlib import suppress
 import pytest
 
 import mortarbench as mb
-from mortarbench import reporting
 from mortarbench.cli.main import main
 from mortarbench.harness.files.reading import read_toml
 from mortarbench.harness.files.store import is_stored
@@ -365,9 +364,7 @@ def cli(tmp_path, capsys, monkeypatch):
 def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
     cli, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(
-        reporting, "report", lambda *_, **__: reporting.Report(files=())
-    )
+    monkeypatch.setattr(mb, "report", lambda *_, **__: mb.Report(files=()))
     asked = ("run", "s.toml", "--plugin", TOY_PROBLEM, "--repeats", 1)
     (tmp_path / "s.toml").write_text(
         suite('"exact", "picky", "liar", "lost"', depths="2")
