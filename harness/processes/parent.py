@@ -9,8 +9,8 @@ removes a process from the tree. The tree is killed when COMMAND ends, when the 
 receives SIGTERM, and when the process RUN has ended.
 
 Run as ``parent.py rank RECORD COMMAND…``, the script is the parent of one MPI rank: it
-starts COMMAND, writes the process ID and later the wait status of COMMAND to the file
-descriptor RECORD, and exits with the same code or signal.
+starts COMMAND, writes the IDs of both processes, and later the wait status of COMMAND,
+to the file descriptor RECORD, and exits with the same code or signal.
 
 The process of the run is not a sub-reaper itself: if it were killed, it could not clean
 up, and in a Python session it would adopt unrelated processes.
@@ -27,7 +27,7 @@ import time
 from contextlib import suppress
 
 END_SECONDS = 5.0  #: longest time to wait for the end of processes after SIGKILL, s
-_WAKE_SECONDS = 0.5  # time between two checks that the process of the run exists
+_WAKE_SECONDS = 1.0  # time between two checks that the process of the run exists
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # constants of prctl(2)
 _SIGNALS = (signal.SIGCHLD, signal.SIGTERM)
 #: environment variables that contain the rank: MPICH, Open MPI, PMIx
@@ -63,8 +63,8 @@ def main(arguments: list[str]) -> None:
         os.close(int(fd))
     ended: dict[int, int] = {}
     while worker not in ended and os.getppid() == int(run):
-        received = signal.sigtimedwait(_SIGNALS, _WAKE_SECONDS)
-        if received is not None and received.si_signo == signal.SIGTERM:
+        got = signal.sigtimedwait(_SIGNALS, _WAKE_SECONDS)
+        if got is not None and got.si_signo == signal.SIGTERM:
             break
         ended |= _reap()
     deadline = time.monotonic() + END_SECONDS
@@ -81,10 +81,11 @@ def main(arguments: list[str]) -> None:
 def _record_rank(record: int, command: list[str]) -> None:
     rank = next((os.environ[name] for name in _RANKS if name in os.environ), "-1")
     child = _start(command)
-    # a write of a short line is atomic, so that lines of ranks do not interleave
-    os.write(record, f'{{"rank": {rank}, "process": {child}}}\n'.encode())
+    line = f'{{"rank": {rank}, "processes": [{child}, {os.getpid()}]}}\n'
+    os.write(record, line.encode())  # short lines of ranks do not interleave
     status = os.waitpid(child, 0)[1]
-    os.write(record, f'{{"rank": {rank}, "status": {status}}}\n'.encode())
+    with suppress(BrokenPipeError):  # the reader ends after the first rank has ended
+        os.write(record, f'{{"rank": {rank}, "status": {status}}}\n'.encode())
     _end_as(status)
 
 

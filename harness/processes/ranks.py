@@ -105,7 +105,7 @@ class _RankExits:
     def __init__(self, record: int, ranks: int) -> None:
         self._record = record
         self._ranks = ranks
-        self._rank_of: dict[int, int] = {}  # rank by pidfd of its process
+        self._rank_of: dict[int, int] = {}  # rank by pidfds of its two processes
         self._first: list[int | str] = []  # ranks that ended, or messages of failures
         self._ways: dict[int, str] = {}  # descriptions of exits by rank
         self._events = epoll()
@@ -150,12 +150,13 @@ class _RankExits:
                 self._ways[line["rank"]] = _describe_exit(line["status"])
             else:
                 try:
-                    process = os.pidfd_open(line["process"])
+                    ends = [os.pidfd_open(number) for number in line["processes"]]
                 except ProcessLookupError:  # ended before its record was read
                     self._first.append(line["rank"])
-                else:
-                    self._rank_of[process] = line["rank"]
-                    self._events.register(process, EPOLLIN)
+                    continue
+                for end in ends:
+                    self._rank_of[end] = line["rank"]
+                    self._events.register(end, EPOLLIN)
 
 
 def _describe_exit(status: int) -> str:

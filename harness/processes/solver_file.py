@@ -9,19 +9,18 @@ also stored with their code.
 
 from __future__ import annotations
 
-import json
+import os
 import pickle
-import subprocess
 import sys
+import sysconfig
 from collections.abc import Iterator
 from contextlib import ExitStack
-from functools import cache
-from importlib.machinery import PathFinder
 from pathlib import Path
+from site import getsitepackages, getusersitepackages
 from types import ModuleType
 from typing import Any
 
-from mortarbench.harness.errors import FaultError, InputError, one_line
+from mortarbench.harness.errors import InputError, one_line
 from mortarbench.harness.plugin import Solver
 
 
@@ -75,45 +74,21 @@ def read_solver(path: Path) -> Any:
 
 
 def _modules_unknown_to_workers() -> Iterator[ModuleType]:
-    """Yield loaded modules that a worker would not find in the same file."""
-    importable: dict[str, bool] = {}  # True if workers find it, by top-level package
+    """Yield loaded modules that a worker would not find.
+
+    A worker finds mortarbench, the standard library, and modules in site packages or
+    PYTHONPATH.
+    """
+    paths = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    paths += [sysconfig.get_path("stdlib"), getusersitepackages(), *getsitepackages()]
+    known = tuple(f"{os.path.realpath(path)}{os.sep}" for path in filter(None, paths))
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        if not isinstance(module, ModuleType) or not str(file).endswith(".py"):
-            continue
-        if name == "__main__" or module.__name__ != name:
-            continue
-        top = name.partition(".")[0]
-        if top not in importable:
-            importable[top] = top in sys.stdlib_module_names or _is_importable(
-                sys.modules.get(top)
-            )
-        if not importable[top]:
+        if (
+            isinstance(module, ModuleType)
+            and str(file).endswith(".py")
+            and name == module.__name__ != "__main__"
+            and name.partition(".")[0] != "mortarbench"
+            and not os.path.realpath(str(file)).startswith(known)
+        ):
             yield module
-
-
-def _is_importable(module: ModuleType | None) -> bool:
-    """Return True if a worker that imports this name would load the same module."""
-    if module is None:
-        return False
-    spec = PathFinder.find_spec(module.__name__, [*_worker_path()])
-    if spec is None:
-        return False
-    here = (getattr(module, "__file__", None), *getattr(module, "__path__", ()))
-    there = (spec.origin, *(spec.submodule_search_locations or ()))
-    return bool({*filter(None, here)} & {*filter(None, there)})
-
-
-@cache
-def _worker_path() -> tuple[str, ...]:
-    """Return `sys.path` of an interpreter started with the options of a worker."""
-    program = "import json, sys; print(json.dumps(sys.path))"
-    process = subprocess.run(
-        [sys.executable, "-P", "-c", program],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if process.returncode:
-        raise FaultError(f"{sys.executable}: {one_line(process.stderr)}")
-    return tuple(json.loads(process.stdout))

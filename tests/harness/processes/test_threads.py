@@ -243,10 +243,11 @@ def test_a_terminated_solve_cleans_up_and_prints_one_line(tmp_path, number, code
     process = int((tmp_path / "started").read_text())
     solve.send_signal(number)
     solve.send_signal(number)  # the second signal does not interrupt the cleanup
-    said = solve.communicate()[1]
+    said = solve.communicate()[1].splitlines()
 
     assert solve.returncode == code
-    assert len(said.splitlines()) == 1, said
+    # a slow machine also prints the progress
+    assert len([line for line in said if ": solving " not in line]) == 1, said
     assert not list(tmp_path.glob("mortarbench-*"))
     assert soon(lambda: not is_alive(process))
 
