@@ -53,7 +53,7 @@ bench: setup  ## time our own kernels (pytest-benchmark)
 	$(BIN)/pytest benchmarks --benchmark-warmup=on \
 	    --benchmark-sort=name --benchmark-columns=min,median,iqr,rounds
 
-docs: setup  ## write docs/solvers*.md and mortarbench/catalogue.json from the adapters
+docs: setup  ## write docs/solvers*.md from the adapters
 	@$(BIN)/python tools/catalogue.py
 
 weaknesses: setup  ## measure effects of equivalent formulations, for the site (minutes)

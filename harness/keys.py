@@ -75,6 +75,12 @@ class Key:
     range: Range = Range()
     help: str = ""
 
+    def __str__(self) -> str:
+        values = " | ".join(map(str, self.choices))
+        if self.range != Range():
+            values = f"{self.kind.__name__}, {self.range}"
+        return f"{values or self.kind.__name__}: {self.help}".removesuffix(": ")
+
     def typed(self, value: object, *, is_text: bool = False) -> Value:
         """Return a value with the type of the key; an integer may become a float.
 

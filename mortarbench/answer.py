@@ -314,7 +314,9 @@ def solve(
     """
     tol = checked.tolerance(tol)
     requested = _merged(options, more)
-    check_solver(solver)
+    if not isinstance(solver, str):
+        with checked.located("solver"):
+            check_solver(solver)
     problem = as_case(case, plugins)
     ranks_asked(ranks, "ranks")
     time_limit = checked.positive("time_limit", time_limit)

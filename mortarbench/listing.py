@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import fields
-from functools import cache
 from html import escape
 from operator import attrgetter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mortarbench.harness.keys import keys_of
 from mortarbench.harness.plugin import About, Solver
 from mortarbench.harness.registry import options_of
 from mortarbench.registries import Plugins, Registries, load_registries
-from mortarbench.solvers import SOLVERS
 from mortarbench.text import first_comment, first_sentence, listing
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-#: File with descriptions of the built-in solvers, so that `list solvers` does not
-#: import them. `make docs` writes the file, and a test compares its contents with the
-#: solvers.
-CATALOGUE = Path(__file__).with_name("catalogue.json")
 
 
 class Listing(tuple[Mapping[str, Any], ...]):
@@ -74,20 +65,22 @@ def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> L
 
     """
     registries = load_registries(plugins, registries)
-    entries = getattr(registries.solvers, "entries", {})
     return Listing(
-        _row(
-            name,
-            catalogue()[name]
-            if name in SOLVERS and entries.get(name) is SOLVERS.entries[name]
-            else describe(registries.solvers[name]),
-        )
-        for name in registries.solvers
+        {
+            "name": name,
+            "description": _description(solver),
+            "options": options_of(solver),
+        }
+        for name, solver in registries.solvers.items()
     )
 
 
 def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> Listing:
-    """List the families: name, description, keys with their defaults, and forms.
+    """List the families: name, description, keys, and forms.
+
+    The row of a family contains the defaults of its keys, and under ``keys`` a text for
+    each key: its range or its values, and its meaning. The default None means that the
+    value follows from the file of the case.
 
     plugins : Python files with more families
     registries : used instead of built-in registries, installed plug-ins and `plugins`
@@ -110,6 +103,7 @@ def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> 
             "name": name,
             "description": first_sentence(family),
             "defaults": family.params,
+            "keys": {key.name: str(key) for key in keys_of(type(family)).values()},
             "forms": family.forms,
         }
         for name, family in registries.families.items()
@@ -137,38 +131,12 @@ def suites(*, registries: Registries | None = None) -> Listing:
     )
 
 
-def describe(solver: Solver) -> dict[str, Any]:
-    """Return the entry of a solver in the catalogue, as plain data."""
-    facts = about(solver)
-    return {
-        "about": None
-        if facts is None
-        else {f.name: getattr(facts, f.name) for f in fields(About)},
-        "sentence": first_sentence(solver),
-        "options": options_of(solver),
-    }
-
-
-def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a `Listing` that describes a solver.
-
-    The description contains a remark if the library of the solver is missing.
-
-    entry : entry of the solver in the catalogue, see `describe`
-    """
-    line = entry["sentence"]
-    if entry["about"] is not None:
-        facts = About(**entry["about"])
-        parts = [f"{facts.title}, {facts.method}", facts.missing]
-        line = "; ".join(filter(None, parts))
-    return {"name": name, "description": line, "options": entry["options"]}
-
-
-@cache
-def catalogue() -> dict[str, Any]:
-    """Read the catalogue of the built-in solvers, without importing the solvers."""
-    entries: dict[str, Any] = json.loads(CATALOGUE.read_text("utf-8"))
-    return entries
+def _description(solver: Solver) -> str:
+    """Return title and method, with a remark if the library is not installed."""
+    if (facts := about(solver)) is None:
+        return first_sentence(solver)
+    parts = [f"{facts.title}, {facts.method}", facts.missing]
+    return "; ".join(filter(None, parts))
 
 
 def about(solver: Solver) -> About | None:

@@ -16,7 +16,7 @@ from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.ranks import launch
 from mortarbench.harness.processes.solver_file import read_solver
 from mortarbench.harness.processes.worker import Worker, serve
-from mortarbench.harness.registry import SolverSpec, resolve, stand_for_harness
+from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.registries import Registries, with_history
 
 
@@ -28,7 +28,6 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     """
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
-    stand_for_harness()
     registries = registries.with_files(request["plugins"])
     solver = None
     if "name" in request:

@@ -21,7 +21,7 @@ from mortarbench.harness.registry import (
     Plugin,
     PluginFile,
     SolverSpec,
-    entry_point_plugins,
+    entry_points_of,
     load_plugin,
     merged,
     options_of,
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 #: These actions change global state of the process: the number of threads, standard
 #: output and the registered modules.
 TURN = ForkSafeLock()
+
+_PROBLEMS, _SOLVERS = "mortarbench.problems", "mortarbench.solvers"  # entry points
 
 #: Python files that define SOLVERS or PROBLEMS; a string may have the form
 #: LABEL=FILE.py. The text is the option of commands
@@ -255,7 +257,7 @@ class Registries:
         request: dict[str, Any] = {
             "name": spec.name,
             "options": spec.options if copy is None else {},
-            "plugins": self._absolute_files(),
+            "plugins": self._absolute_files(spec.name.partition(":")[0]),
             "records": records,
         }
         if copy is not None:
@@ -299,8 +301,14 @@ class Registries:
             # if not, the limits were set after the libraries had been loaded
         return capture_in(ONE_THREAD, self.files, PACKAGES)
 
-    def _absolute_files(self) -> list[str]:
-        return [str(file.resolved()) for file in self.files]
+    def _absolute_files(self, label: str = "") -> list[str]:
+        """Return the plug-in files, those with a label first.
+
+        Imports in calls search the folders of the plug-ins in this order, and two
+        versions of a plug-in import different modules with the same names.
+        """
+        files = sorted(self.files, key=lambda file: file.label != label)
+        return [str(file.resolved()) for file in files]
 
     def suite_path(self, text: str | Path) -> Path:
         """Return the path of a suite, specified by its path or by its name in `suites`.
@@ -339,13 +347,19 @@ def with_history(spec: SolverSpec, solvers: Mapping[str, Solver]) -> SolverSpec:
 def installed(registries: Registries) -> Registries:
     """Return registries extended by the plug-ins of installed packages (entry points).
 
+    A plug-in is imported when its name is used.
+
     Raises
     ------
     InputError
-        If a plug-in cannot be imported, or a name in it exists already.
+        If a name in a plug-in exists already.
 
     """
-    return registries.extended(entry_point_plugins())
+    return replace(
+        registries,
+        families=merged("problem", registries.families, entry_points_of(_PROBLEMS)),
+        solvers=merged("solver", registries.solvers, entry_points_of(_SOLVERS)),
+    )
 
 
 @TURN

@@ -258,7 +258,9 @@ def test_solver(
     {}
 
     """
-    check_solver(solver)
+    if not isinstance(solver, str):
+        with checked.located("solver"):
+            check_solver(solver)
     checked.positive("time_limit", time_limit)
     checked.function("progress", progress)
     registries = load_registries(plugins) if registries is None else registries

@@ -196,3 +196,6 @@ def _model(highspy: Any, qp: QP, scale: float) -> Any:
     hessian.start_, hessian.index_ = P.indptr, P.indices
     hessian.value_ = P.data
     return model
+
+
+HIPO = HiGHS(method="hipo")

@@ -131,3 +131,6 @@ class OSQP(SequenceAdapter):
             solver.warm_start(x=s.x, y=to_two_sided(qp, s) * scale)
 
         return Session(solve, update, start)
+
+
+POLISH = OSQP(polishing=True)

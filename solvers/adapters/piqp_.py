@@ -121,3 +121,7 @@ class PIQP(SequenceAdapter):
             solver.update(c=c, b=new.b, h_u=h, x_l=new.lb, x_u=new.ub)
 
         return Session(solve, update)
+
+
+DENSE = PIQP(backend="dense")
+SPARSE = PIQP(backend="sparse")

@@ -213,3 +213,7 @@ class _Sparse:
 
     def inequality_multipliers(self, s: Solution) -> Vector:
         return np.concatenate([s.z, s.z_box[has_bound(self.qp)]])
+
+
+DENSE = ProxQP(backend="dense")
+SPARSE = ProxQP(backend="sparse")

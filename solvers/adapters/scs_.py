@@ -126,3 +126,6 @@ class SCS(SequenceAdapter):
             solver.update(b=to_cone(new).rhs, c=new.q.copy())
 
         return Session(solve, update, starts.append)
+
+
+QDLDL = SCS(linear_solver="qdldl")

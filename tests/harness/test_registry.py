@@ -1,23 +1,25 @@
 """Registries: solvers by name, options by name and type, plug-ins by path."""
 
+import json
 import sys
 from dataclasses import dataclass
 from typing import Any, Literal
-from zipfile import ZipFile
 
 import pytest
 
-from mortarbench.harness import QP, InputError, Solution
+from mortarbench.harness import InputError
 from mortarbench.harness.registry import (
     PluginFile,
+    Registry,
     SolverSpec,
-    entry_point_plugins,
+    check_solver,
+    entry_points_of,
     load_plugin,
     merged,
     options_of,
     resolve,
 )
-from mortarbench.problems.elastic import one_step
+from mortarbench.registries import Registries
 
 
 @dataclass(frozen=True)
@@ -217,12 +219,15 @@ def family(key="n: int = 1", forms="('p',)", made="Mine()"):
         ("raise SystemExit(3)", "failed to import: SystemExit: 3"),
         ("solvers = {}", "defines neither SOLVERS nor PROBLEMS"),
         ("SOLVERS = [1]", "SOLVERS is of type list; expected dict"),
-        ("SOLVERS = {'a': 1}", "SOLVERS['a']: of type int; expected a solver"),
+        ("SOLVERS = {'a': 1}", "SOLVERS['a']: 1 is of type int; expected a so"),
         (
             PLUGIN + "SOLVERS = {3: Mine()}",
             "SOLVERS[3]: the key is not a string",
         ),
-        (PLUGIN + "SOLVERS = {'a': Mine}", "SOLVERS['a']: a class; expected an ins"),
+        (
+            PLUGIN + "SOLVERS = {'a': Mine}",
+            "SOLVERS['a']: Mine is a class; expected an i",
+        ),
         ("PROBLEMS = {'a': 1}", "PROBLEMS['a']: of type int; expected a froz"),
         (
             family("n: int | str = 1"),
@@ -257,7 +262,7 @@ def test_a_plugin_that_fails_to_import_leaves_no_module(tmp_path):
     with pytest.raises(InputError):
         load_plugin(file)
 
-    assert not [name for name in sys.modules if name.startswith("plugin_half")]
+    assert not [name for name in sys.modules if "plugin_half" in name]
 
 
 def test_a_plugin_that_is_missing_or_not_a_python_file_is_refused(tmp_path):
@@ -287,43 +292,39 @@ def install(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("metadata", ["its-1.0.dist-info", "its.egg-info"])
-def test_entry_points_are_solvers_under_their_names(install, metadata):
-    install(metadata, "[mortarbench.solvers]\nmine = fractions:Fraction.from_float\n")
+def test_entry_points_are_imported_when_their_names_are_used(install, metadata):
+    folder = install(metadata, "[mortarbench.solvers]\nmine = its_own:MINE\n")
+    (folder / "its_own.py").write_text(f"{PLUGIN}\nMINE = SOLVERS['mine']")
+    solvers = merged("solver", {}, entry_points_of("mortarbench.solvers"))
 
-    with pytest.raises(InputError, match=r"entry points: SOLVERS\['mine'\]: of "):
-        entry_point_plugins()
-
-
-def test_an_entry_point_that_fails_to_import_is_named(install):
-    install("its-1.0.dist-info", "[mortarbench.problems]\nmine = no_such_module:X\n")
-
-    with pytest.raises(
-        InputError, match="entry point no_such_module:X: failed to import: Mod"
-    ):
-        entry_point_plugins()
+    assert "its_own" not in sys.modules
+    assert solvers["mine"].tries == 3
 
 
-def test_entry_points_in_an_archive_are_found(tmp_path, monkeypatch):
-    with ZipFile(tmp_path / "its.zip", "w") as archive:
-        archive.writestr("its-1.0.dist-info/METADATA", "Name: its\n")
-        archive.writestr(
-            "its-1.0.dist-info/entry_points.txt",
-            "[mortarbench.problems]\nmine = no_such_module:X\n",
-        )
-    monkeypatch.syspath_prepend(tmp_path / "its.zip")
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("no_such_module:X", "no_such_module:X: failed to import: ModuleNotFound"),
+        ("fractions:X", "fractions:X: failed to import: AttributeError"),
+        (
+            "fractions:Fraction",
+            "fractions:Fraction, registered as 'mine': .*expected a",
+        ),
+    ],
+)
+def test_an_entry_that_is_not_a_solver_is_named(place, message):
+    with pytest.raises(InputError, match=message):
+        Registry({"mine": place}, check_solver)["mine"]
 
-    with pytest.raises(InputError, match="entry point no_such_module:X"):
-        entry_point_plugins()
 
-
-def test_entry_points_of_other_groups_are_not_loaded(install):
+def test_entry_points_of_other_groups_are_not_solvers(install):
     install("its-1.0.dist-info", "[console_scripts]\nmortarbench = no_such_module:X\n")
 
-    assert not entry_point_plugins().solvers
+    assert entry_points_of("mortarbench.solvers") == {}
 
 
 def test_a_name_that_exists_cannot_be_taken_by_a_plugin():
-    assert merged("solver", {"a": 1}, {"b": 2}) == {"a": 1, "b": 2}
+    assert dict(merged("solver", {"a": 1}, {"b": 2})) == {"a": 1, "b": 2}
     with pytest.raises(InputError, match="solver 'a' of the plug-in already exists"):
         merged("solver", {"a": 1}, {"a": 2})
 
@@ -339,8 +340,7 @@ from dataclasses import dataclass
 class Mine:
     def declines(self, qp):
         from late import WHY
-        import tools.speed as speed
-        return f"{WHY} {helper.VERSION} {FAST} {speed.FAST}"
+        return f"{WHY} {helper.VERSION} {FAST}"
     def prepare(self, qp, tol): raise AssertionError("it is only named, never run")
 
 SOLVERS = {"mine": Mine()}
@@ -351,74 +351,63 @@ def version(folder, number):
     """Write a plug-in and neighbour modules that contain a version; return its path."""
     (folder / "tools").mkdir(parents=True)
     (folder / "mine.py").write_text(WITH_NEIGHBOURS)
-    (folder / "helper.py").write_text("from .constants import VERSION")
+    (folder / "helper.py").write_text("from constants import VERSION")
     (folder / "constants.py").write_text(f"VERSION = {number}")
-    (folder / "late.py").write_text("import helper\nWHY = f'late {helper.VERSION}'")
+    (folder / "late.py").write_text(f"WHY = 'late {number}'")
     (folder / "tools" / "__init__.py").write_text("")
     (folder / "tools" / "speed.py").write_text(f"FAST = 'fast {number}'")
     return folder / "mine.py"
 
 
+@pytest.fixture(autouse=True)
+def own_path(monkeypatch):
+    """Restore `sys.path` and `sys.modules` after each test."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
 def test_two_versions_of_a_plugin_import_separate_neighbour_modules(tmp_path):
-    """Neighbours are imported when the plug-in is loaded, or later in a call."""
-    files = {n: version(tmp_path / f"v{n}", n) for n in (1, 2)}
+    """Imports in calls find the neighbours of the plug-in that was loaded first."""
+    files = {n: version(tmp_path / f"v{n}", n) for n in (2, 1)}
     solvers = {}
     for number, file in files.items():
         solvers |= load_plugin(f"v{number}={file}").solvers
 
     assert {name: solver.declines(None) for name, solver in solvers.items()} == {
-        "v1:mine": "late 1 1 fast 1 fast 1",
-        "v2:mine": "late 2 2 fast 2 fast 2",
+        "v2:mine": "late 2 2 fast 2",
+        "v1:mine": "late 2 1 fast 1",
     }
-    assert not {"helper", "constants", "late", "tools.speed"} & set(sys.modules)
+    assert not {"helper", "constants", "tools.speed"} & set(sys.modules)
+
+
+def test_the_worker_of_a_labelled_solver_loads_its_own_plugin_first(tmp_path):
+    files = [f"v{n}={version(tmp_path / f'v{n}', n)}" for n in (1, 2)]
+    registries = Registries().with_files(files)
+
+    for label in ("v1", "v2"):
+        command = registries.worker_command(spec(f"{label}:mine"))
+        (first, _) = json.loads(command[-1])["plugins"]
+        assert first.startswith(f"{label}=")
 
 
 def test_a_changed_neighbour_module_is_imported_again(tmp_path):
     file = version(tmp_path / "v", 1)
-    load_plugin(file).solvers["mine"].declines(None)
+    load_plugin(file)
     (tmp_path / "v" / "constants.py").write_text("VERSION = 345")
 
-    assert load_plugin(file).solvers["mine"].declines(None).startswith("late 345 345")
+    assert load_plugin(file).solvers["mine"].declines(None) == "late 1 345 fast 1"
 
 
-def test_modules_beside_a_plugin_replace_no_mortarbench_or_python_module(tmp_path):
-    for name in ("harness", "json", "mortarbench"):
+def test_modules_beside_a_plugin_replace_no_loaded_module(tmp_path):
+    for name in ("json", "mortarbench"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('mine')")
     file = tmp_path / "plug.py"
-    file.write_text(f"{PLUGIN}\nimport json, mortarbench\nfrom harness import QP")
+    file.write_text(f"{PLUGIN}\nimport json, mortarbench\nfrom mortarbench import QP")
 
     assert list(load_plugin(file).solvers) == ["mine", "mine-9"]
-
-
-OF_OLD = """
-import harness, harness.qp as of_qp
-import solvers
-from harness import QP
-from problems.elastic import one_step
-
-class Mine:
-    def declines(self, qp):
-        import harness.errors
-        from harness import Solution
-        from harness.solution import Solution as same
-        return [harness.QP, QP, of_qp.QP, Solution, same, one_step, solvers]
-    def prepare(self, qp, tol): raise AssertionError("it is only named, never run")
-
-SOLVERS = {"mine": Mine()}
-"""
-
-
-def test_former_package_names_remain_valid_in_plugins(tmp_path):
-    """Also test imports in calls. A neighbour `solvers` replaces the former package."""
-    (tmp_path / "solvers.py").write_text("NAME = 'of the user'")
-    (tmp_path / "plug.py").write_text(OF_OLD)
-    of_user = sys.modules.get("harness")
-
-    *classes, beside = load_plugin(tmp_path / "plug.py").solvers["mine"].declines(None)
-
-    assert classes == [QP, QP, QP, Solution, Solution, one_step]
-    assert beside.NAME == "of the user"
-    assert sys.modules.get("harness") is of_user
 
 
 def test_a_traceback_of_a_plugin_names_its_lines(tmp_path):
@@ -433,18 +422,6 @@ def test_a_traceback_of_a_plugin_names_its_lines(tmp_path):
     places = [(t.path.name, t.lineno + 1) for t in e.traceback]
     assert ("plug.py", 9) in places
     assert places[-1] == ("late.py", 3)
-
-
-def test_entry_points_can_import_harness_by_its_former_name(install):
-    folder = install(
-        "its-1.0.dist-info", "[mortarbench.solvers]\nmine = its_own:MINE\n"
-    )
-    of_old = f"from harness import QP{PLUGIN.replace('from __future__', '#')}"
-    (folder / "its_own.py").write_text(of_old + "\nMINE = SOLVERS['mine']")
-    of_user = sys.modules.get("harness")
-
-    assert list(entry_point_plugins().solvers) == ["mine"]
-    assert sys.modules.get("harness") is of_user
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,7 @@ def test_suites_are_listed_with_their_purpose(cli):
     [
         ("problems", {"name": "well", "forms": ["primal", "dual"],
                       "defaults": {"n": 3, "depth": 1},
+                      "keys": {"n": "int, at least 1: unknowns", "depth": "int"},
                       "description": "Separable quadratics over x ≥ 0."}),
         ("solvers", {"name": "exact", "options": {"factor": 1.0, "reason": None},
                      "description": "Solver for P = I and inactive bounds."}),

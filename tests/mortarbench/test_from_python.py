@@ -554,7 +554,7 @@ def test_the_public_names_suffice_for_plug_ins(tmp_path):
         ),
         (
             lambda: mb.solve(QP, None),
-            "solver = None; expected the name of a solver, or",
+            "solver: None is of type NoneType; expected a solver",
         ),
         (lambda: mb.solve(QP, ActiveRow), r"is a class; expected .* ActiveRow\(\)"),
         (
@@ -606,7 +606,7 @@ def test_the_public_names_suffice_for_plug_ins(tmp_path):
             lambda: mb.test_solver("clarabel", time_limit="1"),
             "time_limit = '1'; expected a positive number",
         ),
-        (lambda: mb.test_solver(5), "solver = 5; expected the name of a solver"),
+        (lambda: mb.test_solver(5), "solver: 5 is of type int; expected a solver"),
         (lambda: mb.test_solver("clarable"), "did you mean 'clarabel'"),
     ],
 )

@@ -13,7 +13,6 @@ import pytest
 import mortarbench as mb
 from mortarbench.harness import Verdict
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.listing import CATALOGUE, describe
 from mortarbench.progress import remaining, shown
 from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
@@ -217,13 +216,6 @@ def test_lists_are_tables():
     assert "well" in mb.problems(plugins=[TOY_PROBLEM]).names
 
 
-def test_the_catalogue_agrees_with_the_solvers():
-    stored = json.loads(CATALOGUE.read_text())
-    live = {name: describe(solver) for name, solver in SOLVERS.items()}
-
-    assert stored == json.loads(json.dumps(live)), "run `make docs`"
-
-
 def test_a_solver_of_another_registry_has_its_own_description():
     class Other:
         """Another solver."""
@@ -242,7 +234,6 @@ LIGHT = [
     ["--help"],
     ["run", "--help"],
     ["--version"],
-    ["list", "solvers"],
     ["list", "suites"],
     ["solve", "beam-rin/dual", "--solver", "smalbe"],
     ["run", "dem"],
