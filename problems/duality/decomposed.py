@@ -36,7 +36,7 @@ from mortarbench.problems.contact.bodies import (
     support_rows,
 )
 from mortarbench.problems.contact.friction import friction_of
-from mortarbench.problems.contact.results import BulkResults, results_of
+from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.contact.rows import MIN_FREE, ContactRows, without_fixed
 from mortarbench.problems.contact.stepping import LoadPath, Stage, State
 from mortarbench.problems.duality.feti_dual import (
@@ -47,6 +47,7 @@ from mortarbench.problems.duality.feti_dual import (
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
+    ContactSolution,
     ElasticBodies,
     InterfaceState,
 )
@@ -55,10 +56,8 @@ from mortarbench.problems.fem.fixing import fixing_nodes
 from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
-    as_vectors,
     dofs_of,
 )
-from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdivision import Subdivision
@@ -188,7 +187,7 @@ def case_on_ranks(
     others = path.before(choice.step, chosen)
     count = path.iterates(choice.step)
     torn = chosen.problem.served.torn.with_bound(chosen.friction.bound)
-    served = Served(torn, partial(largest_stresses, torn, problem.bodies))
+    served = Served(torn)
     first = path.problems(0)[0].problem.served.torn if others else torn
     linearised = replace(chosen.problem, friction=chosen.friction)
 
@@ -198,10 +197,11 @@ def case_on_ranks(
         mechanics, bound = torn_mechanics(served), chosen.friction.bound
         acts = np.append(np.ones(linearised.rows.c.size), bound) > 0
 
-        def quantities(s: Solution) -> Mapping[str, Any]:
-            state = TornSolution(dual, displacement(s), s, linearised, count)
+        def results(s: Solution) -> Mapping[str, Any]:
+            state = interface_state(dual, linearised, displacement(s), s)
             return {
-                **_quantities(problem, state),
+                **quantities(*state, energy=served.lead("energy", displacement(s))),
+                **problem.results(ContactSolution(state, count)),
                 **decomposition_quantities(served, dual.qp),
             }
 
@@ -209,7 +209,7 @@ def case_on_ranks(
             qp=dual.qp,
             digest=digest_of(served, first, others),
             recover=lambda s: displacement(s) * elastic.length,
-            quantities=quantities,
+            quantities=results,
             certifiable=lambda s: (
                 mechanics(),
                 displacement(s),
@@ -218,6 +218,24 @@ def case_on_ranks(
         )
 
     return CaseOnRanks(served, case)
+
+
+def interface_state(
+    dual: TornDual, at: DecomposedLinearisation, u: Vector, s: Solution
+) -> InterfaceState:
+    """Return the state of the contact interface on rank 0.
+
+    u : (n,) nondimensional displacement
+    s : solution of the dual
+    """
+    diagonal = np.zeros(u.size)
+    if at.friction.bound.size:
+        components = np.unique(at.friction.T.indices)
+        diagonal[components] = dual.parts.diagonal(components)
+    primal = replace(at.primal, P=csc_array(diags_array(diagonal)))
+    y, z = np.zeros(primal.b.size), dual.multipliers(s)
+    whole = Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=np.zeros(u.size))
+    return InterfaceState(at.bodies, primal, whole, at.rows, at.friction)
 
 
 def decompose(
@@ -285,59 +303,6 @@ def _without_supports(contact: Contact, fixed: Nodes, u: Vector) -> Contact:
     return contact._replace(rows=rows, c=contact.c - off @ u)
 
 
-@dataclass(frozen=True, eq=False)
-class TornSolution:
-    """Solution of torn bodies on rank 0; see `ContactSolution`."""
-
-    dual: TornDual
-    u: Vector  #: nondimensional displacement (n,)
-    solution: Solution
-    linearised: DecomposedLinearisation
-    problems: int
-
-    def at(self, component: Nodes) -> Vector:
-        """Return the nondimensional displacement at global components (k,)."""
-        return self.u[component]
-
-    @property
-    def energy(self) -> float:
-        """Nondimensional potential energy ½uᵀKu − fᵀu of all bodies."""
-        torn, parts = self.dual.torn.floating, self.dual.parts
-        v = parts.spread @ self.u
-        return float(v @ parts.product(v) / 2 - v @ torn.f)
-
-    @cached_property
-    def sides(self) -> InterfaceState:
-        """State of the contact interface."""
-        at, n, diagonal = self.linearised, self.u.size, np.zeros(self.u.size)
-        if at.friction.bound.size:
-            components = np.unique(at.friction.T.indices)
-            diagonal[components] = self.dual.parts.diagonal(components)
-        s = Solution(
-            status=Status.SOLVED,
-            x=self.u,
-            y=np.zeros(at.primal.b.size),
-            z=self.dual.multipliers(self.solution),
-            z_box=np.zeros(n),
-        )
-        primal = replace(at.primal, P=csc_array(diags_array(diagonal)))
-        return InterfaceState(at.bodies, primal, s, at.rows, at.friction)
-
-
-def _quantities(problem: ContactProblem, solution: TornSolution) -> dict[str, Any]:
-    """Return the quantities of a solution of torn bodies."""
-    elastic, dual = problem.bodies, solution.dual
-    layout = dual.torn.problem.layout
-    bulk = BulkResults(
-        nodes=layout.nodes,
-        supports=dual.torn.problem.fixed.size,
-        elements=layout.label.size,
-        energy=solution.energy * elastic.force * elastic.length,
-        max_von_mises=dual.served.lead("largest_stresses", solution.u),
-    )
-    return {**results_of(bulk, *solution.sides), **problem.results(solution)}
-
-
 def longitudinal_share(D: NDArray[np.float64]) -> Vector:
     """Return C₁₁ / (C₁₁ + C₆₆), (k,), for elasticity matrices (k, v, v) with entries C.
 
@@ -366,34 +331,3 @@ def elastic_class(
         boundary=dofs_of(np.unique(boundary_facets(cells, dim)), dim),
         stiffness=np.repeat(around / np.bincount(cells.ravel()), dim),
     )
-
-
-#: number of layers of cells around a node on which its recovered stress may depend
-STRESS_LAYERS = 3
-
-
-def largest_stresses(torn: TornBodies, elastic: ElasticBodies, u: Vector) -> Vector:
-    """Return the largest nodal von Mises stress of each body on this rank, Pa.
-
-    u : (n,) nondimensional displacement
-    """
-    materials, plane = elastic.materials, elastic.plane
-    layout, D = torn.problem.layout, elasticity_matrices(materials, plane)
-    points, cells = layout.mesh.points, layout.mesh.cells
-    own = torn.domains.rank[layout.label] == torn.comm.rank
-    u, largest = as_vectors(u * elastic.length, layout.mesh.dim), np.zeros(len(D))
-    for b, material in enumerate(materials):
-        of_body = layout.body_of_cell == b
-        inner = np.zeros(len(points), dtype=bool)
-        inner[cells[own & of_body]] = True
-        near = inner.copy()
-        for _ in range(STRESS_LAYERS):
-            selected = of_body & near[cells].any(axis=1)
-            near[cells[selected]] = True
-        node, corner = np.unique(cells[selected], return_inverse=True)
-        if not node.size:
-            continue
-        part = Mesh(points[node], corner.reshape(-1, cells.shape[1]), {})
-        stress = recover(part, centre_stress(part, D[b], u[node].ravel()))[inner[node]]
-        largest[b] = von_mises(stress, material.nu, plane).max()
-    return largest

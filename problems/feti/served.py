@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from types import SimpleNamespace
@@ -31,8 +30,6 @@ class Served:
     """
 
     torn: TornBodies
-    #: map from a displacement (n,) to the largest stress of each body on this rank
-    stresses: Callable[[Vector], Vector] | None = None
 
     def __post_init__(self) -> None:
         """Let the ranks agree on their subdomains, and compute the rows of B."""
@@ -66,16 +63,14 @@ class Served:
         """Return the weights of the local problems, (N,)."""
         return self.parts.weight
 
+    def energy(self, u: Vector) -> float:
+        """Return the nondimensional energy ½uᵀKu − fᵀu of a displacement (n,)."""
+        v = self.parts.spread @ u
+        return float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
+
     def forget(self) -> None:
         """Discard the factors of the dual operator."""
         vars(self).pop("operator", None)
-
-    def largest_stresses(self, u: Vector) -> Vector:
-        """Return the largest stress of each body, (bodies,)."""
-        assert self.stresses is not None
-        comm, stresses = self.torn.comm, partial(self.stresses, u)
-        found = comm.gather(comm.together(stresses))
-        return np.max(found, axis=0) if found else np.zeros(0)
 
 
 def operator_of(served: Served) -> SerialisableOperator | OperatorOnRanks:
@@ -115,6 +110,11 @@ class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no typ
         """Factorise the subdomains on all ranks."""
         self._served.lead("operator.prepare")
         return self
+
+    def energy(self, u: Vector) -> float:
+        """Return the nondimensional energy ½uᵀKu − fᵀu of a displacement (n,)."""
+        v = self.parts.spread @ u
+        return float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
 
     def forget(self) -> None:
         """Discard all factors; the next product computes them again."""
