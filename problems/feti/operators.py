@@ -252,7 +252,7 @@ class DualOperator:
         if (kind, scaling) not in self._preconditioners:
             blocks, weights = self.weighted_blocks(kind, scaling)
             packed, E, comm = self.packed, self.equalities, self.domains.comm
-            BW = scaled_columns(packed.B, weights)
+            BW = csr_array(packed.B @ diags_array(weights))
             grams = comm.gather(csr_array(BW @ packed.BT))
             inverses: Any = None
             if grams:  # on rank 0
@@ -266,7 +266,8 @@ class DualOperator:
                 packed.block_diagonal(blocks),
                 CompressedRows(csr_array(B_D.T)),
             )
-            outer = DirectSum(Identity(E), contact_factor(contact))
+            none = np.zeros(0, dtype=np.int64)
+            outer = DirectSum(Identity(E), bordered_factor(contact, none))
             self._preconditioners[kind, scaling] = outer, inner
         return self._preconditioners[kind, scaling]
 
@@ -366,11 +367,6 @@ def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
     return values
 
 
-def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
-    """Return B (m, M) with its columns multiplied by weights (M,)."""
-    return csr_array((B.data * weights[B.indices], B.indices, B.indptr), shape=B.shape)
-
-
 def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
     """Drop rounding errors, and coupling of contact with equality rows, from B W Bᵀ."""
     diagonal = gram.diagonal()
@@ -396,11 +392,6 @@ def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, csc_arra
     return inverse, csc_array(
         contact + diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
     )
-
-
-def contact_factor(contact: csc_array) -> LinearMap:
-    """Factorise the block of contact rows of `gram_inverses`."""
-    return bordered_factor(contact, np.zeros(0, dtype=np.int64))
 
 
 def block_pseudoinverse(M: csr_array) -> csr_array:
