@@ -36,8 +36,9 @@ def quantities(
     s: Solution,
     rows: ContactRows,
     friction: Friction = NO_FRICTION,
-    stresses: Mapping[str, Vector] | None = None,
     energy: float | None = None,
+    largest: Vector | None = None,
+    stresses: Mapping[str, Vector] | None = None,
 ) -> dict[str, Any]:
     """Return counts, energy, contact forces and stresses by name.
 
@@ -52,14 +53,18 @@ def quantities(
     Parameters
     ----------
     primal : with friction, the diagonal of P is used
-    stresses : nodal stresses (N,) by name; by default those of linear elasticity
     energy : nondimensional energy; by default the objective of `primal`
+    largest : (bodies,) largest von Mises stresses, Pa; by default those of `stresses`
+    stresses : nodal stresses (N,) by name; by default those of linear elasticity
 
     """
-    l, owner = bodies.length, bodies.body_of_node
-    if stresses is None:
-        stresses, _, owner = _stresses(bodies, s.x * l)
-    stress, nodes = stresses["von_mises"], len(bodies.mesh.points)
+    l, nodes = bodies.length, len(bodies.mesh.points)
+    if largest is None:
+        owner = bodies.body_of_node
+        if stresses is None:
+            stresses, _, owner = _stresses(bodies, s.x * l)
+        largest = np.zeros(len(bodies.names))
+        np.maximum.at(largest, owner, stresses["von_mises"])
     energy = primal.objective(s.x) if energy is None else energy
     forces = contact_forces(bodies, primal, s, friction)
     normal = s.z[: primal.h.size]
@@ -74,7 +79,7 @@ def quantities(
         **_contact_force(bodies, forces),
         "multiplier_sum": float(normal.sum() * bodies.force),
         "max_von_mises": {
-            name: float(stress[owner == b].max()) for b, name in enumerate(bodies.names)
+            name: float(most) for name, most in zip(bodies.names, largest, strict=True)
         },
         "contacts": pair_results(bodies, primal, s, rows, friction),
     } | (

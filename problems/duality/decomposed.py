@@ -53,11 +53,8 @@ from mortarbench.problems.duality.problem import (
 )
 from mortarbench.problems.fem.elasticity import rigid_modes, stiffness
 from mortarbench.problems.fem.fixing import fixing_nodes
-from mortarbench.problems.fem.mesh import (
-    Mesh,
-    Nodes,
-    dofs_of,
-)
+from mortarbench.problems.fem.mesh import Mesh, Nodes, as_vectors, dofs_of
+from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdivision import Subdivision
@@ -187,7 +184,7 @@ def case_on_ranks(
     others = path.before(choice.step, chosen)
     count = path.iterates(choice.step)
     torn = chosen.problem.served.torn.with_bound(chosen.friction.bound)
-    served = Served(torn)
+    served = Served(torn, partial(largest_stresses, torn, problem.bodies))
     first = path.problems(0)[0].problem.served.torn if others else torn
     linearised = replace(chosen.problem, friction=chosen.friction)
 
@@ -200,7 +197,7 @@ def case_on_ranks(
         def results(s: Solution) -> Mapping[str, Any]:
             state = interface_state(dual, linearised, displacement(s), s)
             return {
-                **quantities(*state, energy=served.lead("energy", displacement(s))),
+                **quantities(*state, *served.lead("bulk", displacement(s))),
                 **problem.results(ContactSolution(state, count)),
                 **decomposition_quantities(served, dual.qp),
             }
@@ -331,3 +328,34 @@ def elastic_class(
         boundary=dofs_of(np.unique(boundary_facets(cells, dim)), dim),
         stiffness=np.repeat(around / np.bincount(cells.ravel()), dim),
     )
+
+
+#: number of layers of cells around a node on which its recovered stress may depend
+STRESS_LAYERS = 3
+
+
+def largest_stresses(torn: TornBodies, elastic: ElasticBodies, u: Vector) -> Vector:
+    """Return the largest nodal von Mises stress of each body on this rank, Pa.
+
+    u : (n,) nondimensional displacement
+    """
+    materials, plane = elastic.materials, elastic.plane
+    layout, D = torn.problem.layout, elasticity_matrices(materials, plane)
+    points, cells = layout.mesh.points, layout.mesh.cells
+    own = torn.domains.rank[layout.label] == torn.comm.rank
+    u, largest = as_vectors(u * elastic.length, layout.mesh.dim), np.zeros(len(D))
+    for b, material in enumerate(materials):
+        of_body = layout.body_of_cell == b
+        inner = np.zeros(len(points), dtype=bool)
+        inner[cells[own & of_body]] = True
+        near = inner.copy()
+        for _ in range(STRESS_LAYERS):
+            selected = of_body & near[cells].any(axis=1)
+            near[cells[selected]] = True
+        node, corner = np.unique(cells[selected], return_inverse=True)
+        if not node.size:
+            continue
+        part = Mesh(points[node], corner.reshape(-1, cells.shape[1]), {})
+        stress = recover(part, centre_stress(part, D[b], u[node].ravel()))[inner[node]]
+        largest[b] = von_mises(stress, material.nu, plane).max()
+    return largest

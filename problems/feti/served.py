@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from types import SimpleNamespace
@@ -30,6 +31,8 @@ class Served:
     """
 
     torn: TornBodies
+    #: map from a displacement (n,) to the largest stress of each body on this rank
+    stresses: Callable[[Vector], Vector] | None = None
 
     def __post_init__(self) -> None:
         """Let the ranks agree on their subdomains, and compute the rows of B."""
@@ -63,10 +66,16 @@ class Served:
         """Return the weights of the local problems, (N,)."""
         return self.parts.weight
 
-    def energy(self, u: Vector) -> float:
-        """Return the nondimensional energy ½uᵀKu − fᵀu of a displacement (n,)."""
-        v = self.parts.spread @ u
-        return float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
+    def bulk(self, u: Vector) -> tuple[float, Vector]:
+        """Return ½uᵀKu − fᵀu and the largest stress (bodies,) of each body, Pa.
+
+        u : (n,) nondimensional displacement
+        """
+        assert self.stresses is not None
+        v, comm = self.parts.spread @ u, self.torn.comm
+        energy = float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
+        largest = comm.gather(comm.together(partial(self.stresses, u)))
+        return energy, np.max(largest, axis=0) if largest else np.zeros(0)
 
     def forget(self) -> None:
         """Discard the factors of the dual operator."""
@@ -111,10 +120,16 @@ class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no typ
         self._served.lead("operator.prepare")
         return self
 
-    def energy(self, u: Vector) -> float:
-        """Return the nondimensional energy ½uᵀKu − fᵀu of a displacement (n,)."""
-        v = self.parts.spread @ u
-        return float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
+    def bulk(self, u: Vector) -> tuple[float, Vector]:
+        """Return ½uᵀKu − fᵀu and the largest stress (bodies,) of each body, Pa.
+
+        u : (n,) nondimensional displacement
+        """
+        assert self.stresses is not None
+        v, comm = self.parts.spread @ u, self.torn.comm
+        energy = float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
+        largest = comm.gather(comm.together(partial(self.stresses, u)))
+        return energy, np.max(largest, axis=0) if largest else np.zeros(0)
 
     def forget(self) -> None:
         """Discard all factors; the next product computes them again."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from mortarbench.harness.distributed.factor import with_int32
 from mortarbench.problems.fem.mesh import Nodes
 
 Dense = NDArray[np.float64]
+T = TypeVar("T")
 _STRIP = 256  #: right-hand sides per solve; bounds the memory for the solutions
 
 
@@ -215,6 +216,17 @@ class Subdomains:
         if not R_of:
             return csr_array((0, 0))
         return csr_array(block_diag([csr_array(R_of[k]) for k in self.class_of]))
+
+    def sum(self, part: NDArray[Any]) -> NDArray[Any]:
+        """Return the sum of the contributions of all ranks, on rank 0."""
+        return self.comm.sum(part)
+
+    def evaluated(self, work: Callable[[Any], T], part: Any) -> T:
+        """Return `work` of the sum of a sparse matrix over all ranks, on every rank."""
+        parts = self.comm.gather(part)
+        result: Any = work(sum(parts[1:], start=parts[0])) if parts else None
+        shared: T = self.comm.bcast(result)
+        return shared
 
     def combined(self, v: NDArray[Any]) -> NDArray[Any]:
         """Complete a torn vector (N,) with the subdomains of the other ranks."""
