@@ -197,11 +197,6 @@ class UnassembledBodies:
         return self.elasticity[self.body]
 
     @property
-    def moduli(self) -> Vector:
-        """Young's modulus of each body times l/F₀, the factor of K', (bodies,)."""
-        return np.array([m.E for m in self.materials]) * (self.length / self.force)
-
-    @property
     def elasticity(self) -> NDArray[np.float64]:
         """Elasticity matrix of each body, (bodies, v, v), Pa."""
         return elasticity_matrices(self.materials, self.plane)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,50 +30,15 @@ IN_PLANE = ("sxx", "syy", "sxy")
 IN_SPACE = ("sxx", "syy", "szz", "syz", "sxz", "sxy")
 
 
-class BulkResults(NamedTuple):
-    """Results for the bodies, without contact results."""
-
-    nodes: int
-    elements: int
-    supports: int  #: number of prescribed components
-    energy: float  #: ½uᵀKu − fᵀu of eq. (1): J/m in 2D, J in 3D
-    #: (bodies,) largest patch-recovered von Mises stress of each body, Pa
-    max_von_mises: Sequence[float]
-
-
 def quantities(
-    bodies: Bodies,
-    primal: QP,
-    s: Solution,
-    rows: ContactRows,
-    friction: Friction = NO_FRICTION,
-    stresses: Mapping[str, Vector] | None = None,
-) -> dict[str, Any]:
-    """Return counts, energy, contact forces and stresses, see `results_of`.
-
-    stresses : nodal stresses (N,) by name; by default those of linear elasticity
-    """
-    l, owner = bodies.length, bodies.body_of_node
-    if stresses is None:
-        stresses, _, owner = _stresses(bodies, s.x * l)
-    stress = stresses["von_mises"]
-    bulk = BulkResults(
-        nodes=len(bodies.mesh.points),
-        elements=len(bodies.mesh.cells),
-        supports=primal.b.size,
-        energy=primal.objective(s.x) * bodies.force * l,
-        max_von_mises=[stress[owner == b].max() for b in range(len(bodies.names))],
-    )
-    return results_of(bulk, bodies, primal, s, rows, friction)
-
-
-def results_of(
-    bulk: BulkResults,
     bodies: UnassembledBodies,
     primal: QP,
     s: Solution,
     rows: ContactRows,
     friction: Friction = NO_FRICTION,
+    energy: float | None = None,
+    largest: Vector | None = None,
+    stresses: Mapping[str, Vector] | None = None,
 ) -> dict[str, Any]:
     """Return counts, energy, contact forces and stresses by name.
 
@@ -87,25 +52,34 @@ def results_of(
 
     Parameters
     ----------
-    bodies, primal, s, rows, friction : data of all nodes, or of the nodes of contact
-        sides alone; with friction, the diagonal of P is used
+    primal : with friction, the diagonal of P is used
+    energy : nondimensional energy; by default the objective of `primal`
+    largest : (bodies,) largest von Mises stresses, Pa; by default those of `stresses`
+    stresses : nodal stresses (N,) by name; by default those of linear elasticity
 
     """
+    l, nodes = bodies.length, len(bodies.mesh.points)
+    if largest is None:
+        owner = bodies.body_of_node
+        if stresses is None:
+            stresses, _, owner = _stresses(bodies, s.x * l)
+        largest = np.zeros(len(bodies.names))
+        np.maximum.at(largest, owner, stresses["von_mises"])
+    energy = primal.objective(s.x) if energy is None else energy
     forces = contact_forces(bodies, primal, s, friction)
     normal = s.z[: primal.h.size]
     return {
-        "nodes": bulk.nodes,
-        "elements": bulk.elements,
-        "dofs": bodies.mesh.dim * bulk.nodes,
-        "equality_rows": bulk.supports,
+        "nodes": nodes,
+        "elements": len(bodies.mesh.cells),
+        "dofs": bodies.mesh.dim * nodes,
+        "equality_rows": primal.b.size,
         "contact_rows": primal.h.size,
         "active": int(active(normal).sum()),
-        "energy": bulk.energy,
+        "energy": energy * bodies.force * l,
         **_contact_force(bodies, forces),
         "multiplier_sum": float(normal.sum() * bodies.force),
         "max_von_mises": {
-            name: float(largest)
-            for name, largest in zip(bodies.names, bulk.max_von_mises, strict=True)
+            name: float(most) for name, most in zip(bodies.names, largest, strict=True)
         },
         "contacts": pair_results(bodies, primal, s, rows, friction),
     } | (
@@ -274,7 +248,9 @@ def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:
     return {name: np.bincount(node, values) / count for name, values in named.items()}
 
 
-def _stresses(bodies: Bodies, u: Vector) -> tuple[dict[str, Vector], Nodes, Nodes]:
+def _stresses(
+    bodies: UnassembledBodies, u: Vector
+) -> tuple[dict[str, Vector], Nodes, Nodes]:
     """Return the stresses of each body at its nodes, these nodes, and their bodies.
 
     A common node of several bodies, where stresses may jump, occurs once for each body.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -20,7 +20,6 @@ from mortarbench.harness import (
     Mechanics,
     Reference,
     Solution,
-    Vector,
 )
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.balance import least_motion
@@ -37,10 +36,10 @@ from mortarbench.problems.duality.monolithic import monolithic_path
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
+    ContactSolution,
     InterfaceState,
 )
 from mortarbench.problems.fem.inverse import GeneralisedInverse
-from mortarbench.problems.fem.mesh import Nodes
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -68,9 +67,8 @@ def case_of(
 
     def results(s: Solution) -> Mapping[str, Any]:
         state = InterfaceState(bodies, primal, s, whole.rows, friction)
-        solution = MonolithicSolution(state, count)
-        values = quantities(bodies, primal, s, whole.rows, friction)
-        return {**values, **problem.results(solution)}
+        solution = ContactSolution(state, count)
+        return {**quantities(*state), **problem.results(solution)}
 
     case = contact_case(
         bodies,
@@ -102,18 +100,6 @@ def with_exact_tractions(case: Case, exact: NDArray[np.float64]) -> Case:
         return replace(result, contacts=(replace(side, exact=exact),))
 
     return replace(case, fields=fields)
-
-
-@dataclass(frozen=True, eq=False)
-class MonolithicSolution:
-    """Solution for undivided bodies; see `ContactSolution`."""
-
-    sides: InterfaceState
-    problems: int
-
-    def at(self, component: Nodes) -> Vector:
-        """Return the nondimensional displacement at components (k,)."""
-        return self.sides.solution.x[component]
 
 
 def contact_case(

@@ -36,7 +36,7 @@ from mortarbench.problems.contact.bodies import (
     support_rows,
 )
 from mortarbench.problems.contact.friction import friction_of
-from mortarbench.problems.contact.results import BulkResults, results_of
+from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.contact.rows import MIN_FREE, ContactRows, without_fixed
 from mortarbench.problems.contact.stepping import LoadPath, Stage, State
 from mortarbench.problems.duality.feti_dual import (
@@ -47,17 +47,13 @@ from mortarbench.problems.duality.feti_dual import (
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
+    ContactSolution,
     ElasticBodies,
     InterfaceState,
 )
 from mortarbench.problems.fem.elasticity import rigid_modes, stiffness
 from mortarbench.problems.fem.fixing import fixing_nodes
-from mortarbench.problems.fem.mesh import (
-    Mesh,
-    Nodes,
-    as_vectors,
-    dofs_of,
-)
+from mortarbench.problems.fem.mesh import Mesh, Nodes, as_vectors, dofs_of
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
@@ -198,10 +194,11 @@ def case_on_ranks(
         mechanics, bound = torn_mechanics(served), chosen.friction.bound
         acts = np.append(np.ones(linearised.rows.c.size), bound) > 0
 
-        def quantities(s: Solution) -> Mapping[str, Any]:
-            state = TornSolution(dual, displacement(s), s, linearised, count)
+        def results(s: Solution) -> Mapping[str, Any]:
+            state = interface_state(dual, linearised, displacement(s), s)
             return {
-                **_quantities(problem, state),
+                **quantities(*state, *served.lead("bulk", displacement(s))),
+                **problem.results(ContactSolution(state, count)),
                 **decomposition_quantities(served, dual.qp),
             }
 
@@ -209,7 +206,7 @@ def case_on_ranks(
             qp=dual.qp,
             digest=digest_of(served, first, others),
             recover=lambda s: displacement(s) * elastic.length,
-            quantities=quantities,
+            quantities=results,
             certifiable=lambda s: (
                 mechanics(),
                 displacement(s),
@@ -218,6 +215,24 @@ def case_on_ranks(
         )
 
     return CaseOnRanks(served, case)
+
+
+def interface_state(
+    dual: TornDual, at: DecomposedLinearisation, u: Vector, s: Solution
+) -> InterfaceState:
+    """Return the state of the contact interface on rank 0.
+
+    u : (n,) nondimensional displacement
+    s : solution of the dual
+    """
+    diagonal = np.zeros(u.size)
+    if at.friction.bound.size:
+        components = np.unique(at.friction.T.indices)
+        diagonal[components] = dual.parts.diagonal(components)
+    primal = replace(at.primal, P=csc_array(diags_array(diagonal)))
+    y, z = np.zeros(primal.b.size), dual.multipliers(s)
+    whole = Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=np.zeros(u.size))
+    return InterfaceState(at.bodies, primal, whole, at.rows, at.friction)
 
 
 def decompose(
@@ -283,59 +298,6 @@ def _without_supports(contact: Contact, fixed: Nodes, u: Vector) -> Contact:
     rows = csr_array(contact.rows - off)
     rows.eliminate_zeros()
     return contact._replace(rows=rows, c=contact.c - off @ u)
-
-
-@dataclass(frozen=True, eq=False)
-class TornSolution:
-    """Solution of torn bodies on rank 0; see `ContactSolution`."""
-
-    dual: TornDual
-    u: Vector  #: nondimensional displacement (n,)
-    solution: Solution
-    linearised: DecomposedLinearisation
-    problems: int
-
-    def at(self, component: Nodes) -> Vector:
-        """Return the nondimensional displacement at global components (k,)."""
-        return self.u[component]
-
-    @property
-    def energy(self) -> float:
-        """Nondimensional potential energy ½uᵀKu − fᵀu of all bodies."""
-        torn, parts = self.dual.torn.floating, self.dual.parts
-        v = parts.spread @ self.u
-        return float(v @ parts.product(v) / 2 - v @ torn.f)
-
-    @cached_property
-    def sides(self) -> InterfaceState:
-        """State of the contact interface."""
-        at, n, diagonal = self.linearised, self.u.size, np.zeros(self.u.size)
-        if at.friction.bound.size:
-            components = np.unique(at.friction.T.indices)
-            diagonal[components] = self.dual.parts.diagonal(components)
-        s = Solution(
-            status=Status.SOLVED,
-            x=self.u,
-            y=np.zeros(at.primal.b.size),
-            z=self.dual.multipliers(self.solution),
-            z_box=np.zeros(n),
-        )
-        primal = replace(at.primal, P=csc_array(diags_array(diagonal)))
-        return InterfaceState(at.bodies, primal, s, at.rows, at.friction)
-
-
-def _quantities(problem: ContactProblem, solution: TornSolution) -> dict[str, Any]:
-    """Return the quantities of a solution of torn bodies."""
-    elastic, dual = problem.bodies, solution.dual
-    layout = dual.torn.problem.layout
-    bulk = BulkResults(
-        nodes=layout.nodes,
-        supports=dual.torn.problem.fixed.size,
-        elements=layout.label.size,
-        energy=solution.energy * elastic.force * elastic.length,
-        max_von_mises=dual.served.lead("largest_stresses", solution.u),
-    )
-    return {**results_of(bulk, *solution.sides), **problem.results(solution)}
 
 
 def longitudinal_share(D: NDArray[np.float64]) -> Vector:

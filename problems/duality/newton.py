@@ -73,6 +73,7 @@ from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.contact.bodies import (
     Bodies,
     factorise_clamped,
+    is_supported,
     slave_places,
 )
 from mortarbench.problems.contact.rows import ContactRows, without_fixed
@@ -496,7 +497,7 @@ class NewtonPath:
     @cached_property
     def _is_supported(self) -> bool:
         """True if the supports exclude all rigid motions."""
-        return not free_rigid_motions(self.bodies).shape[1]
+        return is_supported(self.bodies)
 
     @cached_property
     def _kernel_defect(self) -> str:
@@ -577,17 +578,6 @@ class NewtonPath:
 def _merit(at: Configuration, weight: float) -> float:
     """Return the merit function φ at a configuration."""
     return at.energy + weight * float(np.maximum(-at.gap, 0.0).sum())
-
-
-def free_rigid_motions(bodies: Bodies) -> NDArray[np.float64]:
-    """Return an orthonormal basis (n, r) of the rigid motions that the supports allow.
-
-    Rotations refer to the undeformed bodies; translations do not depend on the
-    deformation.
-    """
-    rigid = bodies.rigid
-    fixed = rigid[bodies.B_D.indices]
-    return np.asarray(rigid @ null_space(fixed)) if fixed.size else rigid
 
 
 def free_translations(bodies: Bodies) -> list[NDArray[np.float64]]:

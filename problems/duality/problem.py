@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -274,19 +274,16 @@ class InterfaceState(NamedTuple):
     friction: Friction
 
 
-class ContactSolution(Protocol):
+class ContactSolution(NamedTuple):
     """Solution of a contact problem."""
 
-    @property
-    def sides(self) -> InterfaceState:
-        """State of the contact interface."""
-
-    @property
-    def problems(self) -> int:
-        """Number of Tresca problems solved for Coulomb's law; 1 for other laws."""
+    sides: InterfaceState
+    #: number of Tresca problems solved for Coulomb's law; 1 for other laws
+    problems: int
 
     def at(self, component: Nodes) -> Vector:
         """Return the nondimensional displacement at global components (k,)."""
+        return np.asarray(self.sides.solution.x[component])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

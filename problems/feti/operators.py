@@ -39,7 +39,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -160,7 +160,7 @@ def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pack
         number[unknowns.ravel()] = np.arange(end, end + unknowns.size)
         end += unknowns.size
     places = number[B.indices]
-    here = places >= 0  # the columns of other ranks are dropped
+    here = places >= 0  # columns of other processes are dropped
     ends = np.concatenate([[0], np.cumsum(here)])[B.indptr]
     indices = places[here].astype(B.indices.dtype)
     packed = (B.data[here], indices, ends.astype(B.indptr.dtype))
@@ -189,7 +189,7 @@ def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
 class DualOperator:
     """The operator F of decomposed bodies, applied to arrays (m,) or (m, k).
 
-    On several ranks, each rank applies the part of its subdomains. All ranks must call
+    On several processes, each applies the part of its subdomains. All of them must call
     each method together, and the results are valid on rank 0 (`OperatorOnRanks`).
     """
 
@@ -201,7 +201,7 @@ class DualOperator:
 
     def __call__(self, x: Dense) -> Dense:
         """Return Fx."""
-        return self.domains.comm.sum(self.linear_map(x))
+        return self.domains.sum(self.linear_map(x))
 
     @cached_property
     def linear_map(self) -> Composition:
@@ -220,7 +220,7 @@ class DualOperator:
     def preconditioner(self, kind: str, scaling: str) -> LinearMap:
         """Return the map x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for x (m,) or (m, k).
 
-        On several ranks, this is the map `outer` of `preconditioner_parts` only.
+        On several processes, this is the map `outer` of `preconditioner_parts` only.
 
         Parameters
         ----------
@@ -237,9 +237,9 @@ class DualOperator:
         return Composition(outer, inner, outer)
 
     def precondition(self, kind: str, scaling: str, x: Dense) -> Dense:
-        """Apply the map `inner` of `preconditioner_parts` of all ranks."""
+        """Apply the map `inner` of `preconditioner_parts` of all processes."""
         inner = self.preconditioner_parts(kind, scaling)[1]
-        return self.domains.comm.sum(inner(x))
+        return self.domains.sum(inner(x))
 
     def preconditioner_parts(
         self, kind: str, scaling: str
@@ -251,22 +251,20 @@ class DualOperator:
         """
         if (kind, scaling) not in self._preconditioners:
             blocks, weights = self.weighted_blocks(kind, scaling)
-            packed, E, comm = self.packed, self.equalities, self.domains.comm
-            BW = scaled_columns(packed.B, weights)
-            grams = comm.gather(csr_array(BW @ packed.BT))
-            inverses: Any = None
-            if grams:  # on rank 0
-                gram = csr_array(sum(grams[1:], start=grams[0]))
-                inverses = gram_inverses(gram, E)
+            packed, E = self.packed, self.equalities
+            BW = csr_array(packed.B @ diags_array(weights))
             # (B W Bᵀ)⁺ is as sparse as B for equality rows
-            inverse, contact = comm.bcast(inverses)
+            inverse, contact = self.domains.evaluated(
+                partial(gram_inverses, equalities=E), csr_array(BW @ packed.BT)
+            )
             B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
             inner = Composition(
                 CompressedRows(B_D),
                 packed.block_diagonal(blocks),
                 CompressedRows(csr_array(B_D.T)),
             )
-            outer = DirectSum(Identity(E), contact_factor(contact))
+            none = np.zeros(0, dtype=np.int64)
+            outer = DirectSum(Identity(E), bordered_factor(contact, none))
             self._preconditioners[kind, scaling] = outer, inner
         return self._preconditioners[kind, scaling]
 
@@ -311,7 +309,7 @@ class DualOperator:
 
     @cached_property
     def _diagonal(self) -> Vector:
-        return self.domains.comm.sum(self.packed.diagonal(self._blocks[0]))
+        return self.domains.sum(self.packed.diagonal(self._blocks[0]))
 
     @cached_property
     def _blocks(self) -> tuple[list[Any], list[Any]]:
@@ -366,11 +364,6 @@ def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
     return values
 
 
-def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
-    """Return B (m, M) with its columns multiplied by weights (M,)."""
-    return csr_array((B.data * weights[B.indices], B.indices, B.indptr), shape=B.shape)
-
-
 def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
     """Drop rounding errors, and coupling of contact with equality rows, from B W Bᵀ."""
     diagonal = gram.diagonal()
@@ -396,11 +389,6 @@ def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, csc_arra
     return inverse, csc_array(
         contact + diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
     )
-
-
-def contact_factor(contact: csc_array) -> LinearMap:
-    """Factorise the block of contact rows of `gram_inverses`."""
-    return bordered_factor(contact, np.zeros(0, dtype=np.int64))
 
 
 def block_pseudoinverse(M: csr_array) -> csr_array:

@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
-from mortarbench.problems.fem.mesh import Nodes, adjacent_cells
+from mortarbench.problems.fem.mesh import Nodes, adjacent_cells, facet_quadrature
 
 Labels = NDArray[np.int64]
 
@@ -90,25 +90,14 @@ def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
     """
     dim = points.shape[1]
     one, other, facets = adjacent_cells(cells, dim)
-    ends, centre = points[facets], points[cells].mean(axis=1)
-    ratio = _facet_size(ends) / np.linalg.norm(centre[one] - centre[other], axis=1)
-    size = ratio ** ((dim - 1) / dim)
+    centre = points[cells].mean(axis=1)
+    area = np.linalg.norm(facet_quadrature(points, facets)[1].sum(axis=0), axis=1)
+    distance = np.linalg.norm(centre[one] - centre[other], axis=1)
+    size = (area ** (1 / (dim - 1)) / distance) ** ((dim - 1) / dim)
     weight = np.clip(np.rint(UNIT_WEIGHT * size), 1, MAX_WEIGHT).astype(np.int64)
     shape = (len(cells), len(cells))
     half = csr_array((weight, (one, other)), shape=shape)
     return csr_array(half + half.T)
-
-
-def _facet_size(facets: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lengths of edges (k, 2, 2), or square roots of areas of faces (k, 4, 3).
-
-    The area of a warped face is that of its largest projection onto a plane.
-    """
-    if facets.shape[2] == 2:
-        return np.asarray(np.linalg.norm(facets[:, 0] - facets[:, 1], axis=1))
-    one, other = facets[:, 2] - facets[:, 0], facets[:, 3] - facets[:, 1]
-    area = np.linalg.norm(np.cross(one, other), axis=1) / 2
-    return np.asarray(np.sqrt(area))
 
 
 def _partition_body(graph: csr_array, parts: int) -> Labels:

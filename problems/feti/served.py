@@ -66,16 +66,20 @@ class Served:
         """Return the weights of the local problems, (N,)."""
         return self.parts.weight
 
+    def bulk(self, u: Vector) -> tuple[float, Vector]:
+        """Return ½uᵀKu − fᵀu and the largest stress (bodies,) of each body, Pa.
+
+        u : (n,) nondimensional displacement
+        """
+        assert self.stresses is not None
+        v, comm = self.parts.spread @ u, self.torn.comm
+        energy = float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
+        largest = comm.gather(comm.together(partial(self.stresses, u)))
+        return energy, np.max(largest, axis=0) if largest else np.zeros(0)
+
     def forget(self) -> None:
         """Discard the factors of the dual operator."""
         vars(self).pop("operator", None)
-
-    def largest_stresses(self, u: Vector) -> Vector:
-        """Return the largest stress of each body, (bodies,)."""
-        assert self.stresses is not None
-        comm, stresses = self.torn.comm, partial(self.stresses, u)
-        found = comm.gather(comm.together(stresses))
-        return np.max(found, axis=0) if found else np.zeros(0)
 
 
 def operator_of(served: Served) -> SerialisableOperator | OperatorOnRanks:
@@ -115,6 +119,17 @@ class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no typ
         """Factorise the subdomains on all ranks."""
         self._served.lead("operator.prepare")
         return self
+
+    def bulk(self, u: Vector) -> tuple[float, Vector]:
+        """Return ½uᵀKu − fᵀu and the largest stress (bodies,) of each body, Pa.
+
+        u : (n,) nondimensional displacement
+        """
+        assert self.stresses is not None
+        v, comm = self.parts.spread @ u, self.torn.comm
+        energy = float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
+        largest = comm.gather(comm.together(partial(self.stresses, u)))
+        return energy, np.max(largest, axis=0) if largest else np.zeros(0)
 
     def forget(self) -> None:
         """Discard all factors; the next product computes them again."""

@@ -37,7 +37,6 @@ Product = Callable[[Vector], Vector]
 #: matrix, at which the Krylov space counts as invariant and the Lanczos process ends
 BREAKDOWN = 1e-10
 CHECK_INTERVAL = 5  #: number of Lanczos steps between evaluations of the Ritz values
-_CHUNK = 64  #: number of Lanczos vectors per allocation
 
 
 class Spectrum(NamedTuple):
@@ -92,21 +91,17 @@ def spectrum(
     v = P(
         np.sin(1.0 + np.arange(n) ** 2)
     )  # arbitrary vector, rarely orthogonal to eigenvectors
-    V = np.empty((_CHUNK, n))
-    WV = V if M is None else np.empty_like(V)
+    V, WV = list[Vector](), list[Vector]()
     alpha, beta = list[float](), list[float]()
     Wv = metric(v)
     length = float(np.sqrt(v @ Wv))
     for k in range(n):
-        if k == len(V):
-            more = np.empty((_CHUNK, n))
-            V = np.concatenate([V, more])
-            WV = V if M is None else np.concatenate([WV, more])
-        V[k], WV[k] = v / length, Wv / length
+        V.append(v / length)
+        WV.append(Wv / length)
         v = image(WV[k])
         alpha.append(float(v @ WV[k]))
         v -= alpha[-1] * V[k] + (beta[-1] * V[k - 1] if k else 0.0)
-        v = P(v - (WV[: k + 1] @ v) @ V[: k + 1])
+        v = P(v - (np.array(WV) @ v) @ np.array(V))
         Wv = metric(v)
         length = float(np.sqrt(max(float(v @ Wv), 0.0)))
         over = length <= BREAKDOWN * max(alpha)

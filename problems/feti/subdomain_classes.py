@@ -17,13 +17,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, lapack, null_space, qr
-from scipy.sparse import csc_array, csc_matrix, csr_array
+from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze, cholesky
 
 from mortarbench.harness import Vector
@@ -33,6 +32,7 @@ from mortarbench.harness.distributed.factor import with_int32
 from mortarbench.problems.fem.mesh import Nodes
 
 Dense = NDArray[np.float64]
+T = TypeVar("T")
 _STRIP = 256  #: right-hand sides per solve; bounds the memory for the solutions
 
 
@@ -199,19 +199,6 @@ class Subdomains:
                 self.start[members] + np.arange(self.sizes[k])[:, None],
             )
 
-    @cached_property
-    def motions(self) -> NDArray[np.int64]:
-        """First rigid motion of each subdomain, then the total number, (S + 1,).
-
-        All ranks obtain the result.
-        """
-        own = {k: self.template(k).R.shape[1] for k, _ in self.own}
-        modes = np.zeros(self.sizes.size, dtype=np.int64)
-        for k, r in chain.from_iterable(d.items() for d in self.comm.gather(own)):
-            modes[k] = r
-        modes = self.comm.bcast(modes)
-        return np.concatenate([[0], np.cumsum(modes[self.class_of])])
-
     def names(self) -> list[bytes]:
         """Return the digests of all classes."""
         own = {k: self.template(k).name.encode() for k, _ in self.own}
@@ -225,16 +212,21 @@ class Subdomains:
     @cached_property
     def _kernel(self) -> csr_array:
         blocks = self.comm.gather({k: self.template(k).R for k, _ in self.own})
-        motions, sizes = np.diff(self.motions), np.diff(self.start)
-        if not blocks:
-            return csr_array((0, 0))
         R_of = {k: R for one in blocks for k, R in one.items()}
-        entries = np.concatenate([R_of[k].ravel() for k in self.class_of.tolist()])
-        per_row = np.repeat(motions, sizes)
-        ends = np.concatenate([[0], np.cumsum(per_row)])
-        along = np.arange(entries.size) - np.repeat(ends[:-1], per_row)
-        columns = np.repeat(self.motions[:-1], sizes * motions) + along
-        return csr_array((entries, columns, ends), shape=(sizes.sum(), motions.sum()))
+        if not R_of:
+            return csr_array((0, 0))
+        return csr_array(block_diag([csr_array(R_of[k]) for k in self.class_of]))
+
+    def sum(self, part: NDArray[Any]) -> NDArray[Any]:
+        """Return the sum of the contributions of all ranks, on rank 0."""
+        return self.comm.sum(part)
+
+    def evaluated(self, work: Callable[[Any], T], part: Any) -> T:
+        """Return `work` of the sum of a sparse matrix over all ranks, on every rank."""
+        parts = self.comm.gather(part)
+        result: Any = work(sum(parts[1:], start=parts[0])) if parts else None
+        shared: T = self.comm.bcast(result)
+        return shared
 
     def combined(self, v: NDArray[Any]) -> NDArray[Any]:
         """Complete a torn vector (N,) with the subdomains of the other ranks."""

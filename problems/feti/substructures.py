@@ -61,7 +61,7 @@ class LocalProblems:
         T = csr_array(self.spread[rows][:, at])
         ends = np.arange(nodes.size + 1)
         K = csr_array(bsr_array((blocks, ends[:-1], ends), shape=(rows.size,) * 2))
-        return domains.comm.sum(np.asarray(T.multiply(K @ T).sum(axis=0)))
+        return domains.sum(np.asarray(T.multiply(K @ T).sum(axis=0)))
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
         """Apply PKP to v (N,) in the precision of v.

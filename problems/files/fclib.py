@@ -53,7 +53,6 @@ class FclibFile:
     """Contact problem of an FCLIB file, with its solution if the file contains one."""
 
     contact: FrictionalContact
-    is_local: bool
     stored: Vector | None  #: (n,) forces of /solution; None if the file has no solution
     #: (p,) multipliers of /solution; zeros if the file does not contain them
     multipliers: Vector
@@ -116,14 +115,14 @@ def to_contact(arrays: Datasets) -> FclibFile:
         raise InputError(f"spacedim is {dim}; expected 2 or 3")
     if (mu < 0).any():
         raise InputError(f"vectors/mu contains {mu.min():g}; expected only numbers ≥ 0")
-    is_local = kinds[0] == "fclib_local"
-    contact = (_local if is_local else _global)(part, dim * mu.size, mu)
+    local = _local if kinds[0] == "fclib_local" else _global
+    contact = local(part, dim * mu.size, mu)
     solution = _Group("solution", arrays)
     stored = solution.vector("r", contact.q.size) if solution.has("r") else None
     p = contact.b.size
     has_multipliers = stored is not None and solution.has("l") and p > 0
     multipliers = solution.vector("l", p) if has_multipliers else np.zeros(p)
-    return FclibFile(contact, is_local, stored, multipliers)
+    return FclibFile(contact, stored, multipliers)
 
 
 def _local(part: _Group, n: int, mu: Vector) -> FrictionalContact:

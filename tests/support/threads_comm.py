@@ -148,7 +148,6 @@ def unlock(patch: pytest.MonkeyPatch) -> None:
     for all instances.
     """
     for owner, name in (
-        (Subdomains, "motions"),
         (Subdomains, "_kernel"),
         (DualOperator, "linear_map"),
         (DualOperator, "_blocks"),

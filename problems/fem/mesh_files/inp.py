@@ -125,6 +125,9 @@ class _Section(NamedTuple):
         return self.scope.prefix + self.params[key]
 
 
+_EXPONENT = str.maketrans("dD", "ee")  #: letters before exponents in Fortran
+
+
 def _numbers(
     line: int, fields: Sequence[str], kind: Callable[[str], float] = float
 ) -> list[Any]:
@@ -132,15 +135,12 @@ def _numbers(
     numbers = []
     for field in fields:
         try:
-            numbers.append(kind(field))
+            numbers.append(kind(field.translate(_EXPONENT)))
         except ValueError:
-            try:
-                numbers.append(kind(re.sub("[dD]", "e", field)))
-            except ValueError:
-                what = "an integer" if kind is int else "a number"
-                raise InputError(
-                    f"line {line}: {shortened(field)!r}; expected {what}"
-                ) from None
+            what = "an integer" if kind is int else "a number"
+            raise InputError(
+                f"line {line}: {shortened(field)!r}; expected {what}"
+            ) from None
     return numbers
 
 

@@ -250,9 +250,10 @@ def test_rows_are_those_of_sparse_algebra_on_the_whole_body(rows: str) -> None:
     bodies, primal, pair = decomposed_pair(rows)
     label = structured_bodies([(32, 4), (36, 6)], 2)
     parts = decompose(bodies.mesh.points, bodies.mesh.cells, label, bodies.body)
+    moduli = np.array([m.E for m in bodies.materials]) * bodies.length / bodies.force
     expected = glue(
         parts, load=bodies.f, supports=csr_array(primal.A), supported=primal.b,
-        contact=csr_array(primal.G), c=primal.h, E=bodies.moduli[bodies.body_of_node],
+        contact=csr_array(primal.G), c=primal.h, E=moduli[bodies.body_of_node],
         rows=rows,
     )  # fmt: skip
     torn, found = pair.torn, pair.torn.rows

@@ -26,7 +26,7 @@ STAGES = {
         "mortarbench.problems.feti.substructures",
         "LocalProblems.squared_product",
     ),
-    "quantities": ("mortarbench.problems.duality.decomposed", "largest_stresses"),
+    "quantities": ("mortarbench.problems.feti.served", "Served.bulk"),
 }
 KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
 
