@@ -21,7 +21,7 @@ from subprocess import DEVNULL, Popen
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from mortarbench.harness.environment.environment import packages_of
+from mortarbench.harness.environment.environment import digest, packages_of
 from mortarbench.harness.environment.labels import in_words
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.operators import Maker
@@ -213,11 +213,10 @@ class Cluster:
                 "repeat the command to continue"
             ) from None
 
-    def add_node(self, node: str, digest: str, environment: Mapping[str, Any]) -> None:
+    def add_node(self, node: str, environment: Mapping[str, Any]) -> None:
         """Store an environment if it is new, and warn if it differs from the parent's.
 
         node : name of the machine, for messages
-        digest : digest of `environment`
 
         Raises
         ------
@@ -225,7 +224,8 @@ class Cluster:
             If the node runs a different version of the code.
 
         """
-        if digest in self._stored:
+        name = digest(environment)
+        if name in self._stored:
             return
         changed = list(differences(self.environment, environment))
         code = [each for each in changed if each[0].startswith(_CODE)]
@@ -235,10 +235,10 @@ class Cluster:
                 f"{node} runs different code from this machine ({what}); install the "
                 "same code on every node"
             )
-        self._stored.add(digest)
-        self.keep(digest, environment)
+        self._stored.add(name)
+        self.keep(name, environment)
         if changed:
             self.warn(
                 f"{node} measures under different conditions from this machine "
-                f"({what}); its times are marked as those of environment {digest}"
+                f"({what}); its times are marked as those of environment {name}"
             )

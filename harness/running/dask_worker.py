@@ -5,14 +5,13 @@ from __future__ import annotations
 import fcntl
 import os
 import platform
-import sys
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, NamedTuple
+from typing import Any
 
 from distributed import get_worker
 
@@ -26,36 +25,28 @@ from mortarbench.harness.results.work_unit import Commands, Outcome, WorkUnit
 from mortarbench.harness.running.executor import Executor
 
 
-class Delivery(NamedTuple):
-    """Outcomes of a block, with the node and the environment of the measurements."""
-
-    outcomes: list[Outcome]
-    node: str  #: host name
-    digest: str  #: digest of the environment
-    environment: dict[str, Any]
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Setup:
     """Data of a run that each of its blocks needs on a node."""
 
     run: str  #: name that no other run on the cluster has
-    #: commands of the parent, in which the Python interpreter of the node replaces the
-    #: interpreter of the parent
     commands: Commands
-    plugins: tuple[PluginFile, ...]  #: files with the same paths on every node
+    plugins: tuple[PluginFile, ...]
     operators: Mapping[str, Maker]  #: makers of operators P, except those of `plugins`
     #: largest number of Dask workers on one machine, which disturb each other
     sharing: int
     packages: tuple[str, ...]  #: packages whose versions an environment contains
-    python: str = sys.executable
 
 
-def measure(setup: Setup, block: WorkUnit) -> Delivery:
+def measure(setup: Setup, block: WorkUnit) -> tuple[list[Outcome], str, dict[str, Any]]:
     """Measure a block in a Dask worker; stop early if the run has ended.
 
     The CPU of this Dask worker also measures the blocks of its other runs. Built cases
     remain in the folder of the Dask worker until it ends.
+
+    Returns
+    -------
+    outcomes, host name and environment of this machine
 
     Raises
     ------
@@ -70,6 +61,12 @@ def measure(setup: Setup, block: WorkUnit) -> Delivery:
             "blocks at a time, so that they would disturb each other; start it with "
             "--nthreads 1"
         )
+    for path in (Path(setup.commands.case_worker[0]), *(p.path for p in setup.plugins)):
+        if not path.is_file():
+            raise InputError(
+                f"{node}: no file {path}; expected the same interpreter and plug-ins "
+                "under the same paths on every node"
+            )
     environment = _environment(setup.run, setup.plugins, setup.packages)
     if setup.sharing > 1:
         environment["machine"]["shared_by_workers"] = setup.sharing
@@ -78,14 +75,6 @@ def measure(setup: Setup, block: WorkUnit) -> Delivery:
     for file in setup.plugins:
         operators = merged("operator", operators, load_plugin(file).operators)
 
-    def here(command: list[str]) -> list[str]:
-        return [sys.executable if word == setup.python else word for word in command]
-
-    commands = replace(
-        setup.commands,
-        solvers={label: here(c) for label, c in setup.commands.solvers.items()},
-        case_worker=here(setup.commands.case_worker),
-    )
     turns = tuple(
         tuple(record.replace(environment=name, node=node) for record in turn)
         for turn in block.turns
@@ -95,7 +84,7 @@ def measure(setup: Setup, block: WorkUnit) -> Delivery:
     scratch.mkdir(exist_ok=True)
     task = worker.state.tasks[worker.get_current_task()]
     outcomes: list[Outcome] = []
-    executor = Executor(commands, scratch, scratch / "cases", operators)
+    executor = Executor(setup.commands, scratch, scratch / "cases", operators)
     with closing(executor):
         try:
             for outcome in executor.execute(replace(block, turns=turns)):
@@ -104,7 +93,7 @@ def measure(setup: Setup, block: WorkUnit) -> Delivery:
                     break
         except InputError as e:  # the disk of this machine is full
             raise InputError(f"{node}: {e}") from None
-    return Delivery(outcomes, node, name, environment)
+    return outcomes, node, environment
 
 
 @lru_cache(maxsize=1)
@@ -112,12 +101,6 @@ def _environment(
     run: str, plugins: tuple[PluginFile, ...], packages: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return the environment of this node, captured once for each run."""
-    for file in plugins:
-        if not file.path.is_file():
-            raise InputError(
-                f"{platform.node()}: no plug-in {file.path}; "
-                "expected the same files under the same paths on every node"
-            )
     return capture_in(ONE_THREAD, plugins, packages)
 
 

@@ -48,6 +48,7 @@ class Executor:
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     _workers: dict[str, WorkerProcess] = field(default_factory=dict)
     _entries: tuple[StoredCase, ...] = ()  # cases of that block, once they are built
+    _keep: int = 1  # number of cases that the case worker keeps in memory
     # reason why the sequence has fewer cases than requested steps; else empty
     _end_reason: str = ""
     _loaded: dict[str, QP] = field(default_factory=dict)  # QPs of `_entries`, by digest
@@ -73,7 +74,7 @@ class Executor:
         """
         with report_full_disk(self.scratch):
             try:
-                self._entries = ()
+                self._entries, self._keep = (), len(block.cases)
                 for turn in block.turns:
                     yield from self._turn(block, turn)
             except _BuildError as e:
@@ -124,60 +125,65 @@ class Executor:
         """
         source = self._source(turn[0])
         if source is not Source.RANKS:
-            self._build(block, turn)
-        available = turn if source is Source.RANKS else turn[: len(self._entries)]
-        for step, record in enumerate(available):
-            request, record = self._request(block, record, step, source)
-
-            def whole(step: int = step) -> QP:
-                self._build(block, turn)
-                return self._qp(self._entries[step])
-
-            record, solution, needs_evaluation = measure_and_judge(
-                self._worker(turn[0].solver),
-                whole,
-                record,
-                request,
-                time_limit=block.time_limit,
-                memory_limit=block.memory_limit,
-            )
-            if record.status in (Verdict.CRASHED, Verdict.FAILED):
-                refuse_full_disk(self.scratch, "")  # a full disk may be the cause
-            is_pointless = solution is None or not has_point(solution)
-            if solution is None or is_pointless or needs_evaluation:
-                yield self._describe(block, record, solution)
+            self._build(turn)
+        count = len(turn) if source is Source.RANKS else len(self._entries)
+        ended: Record | None = None
+        for step, record in enumerate(turn):
+            if step >= count:
+                status, message = Verdict.DECLINED, self._end_reason
+                yield Result(record=record.replace(status=status, message=message))
+            elif ended is not None:
+                message = f"the sequence ended at {ended.case}: {ended.message}"
+                status = ended.status
+                yield Result(record=record.replace(status=status, message=message))
             else:
-                yield Result(record=record, point=point_arrays(solution))
-            stopped = is_pointless and record.status is not Verdict.DECLINED
-            # a failed step loses the solver's data for later steps
-            if block.is_sequence and stopped:
-                yield from _unreached_steps(available[step + 1 :], record)
-                break
+                result = self._measure(block, turn, step, source)
+                # a failed step loses the solver's data for later steps
+                if (
+                    result.point is None
+                    and result.record.status is not Verdict.DECLINED
+                ):
+                    ended = result.record
+                yield result
         if block.is_sequence and source.is_shared:
             self._worker(turn[0].solver).close()  # ranks remain between steps only
-        for record in turn[len(available) :]:
-            declined = record.replace(status=Verdict.DECLINED, message=self._end_reason)
-            yield Result(record=declined)
 
-    def _request(
-        self, block: WorkUnit, record: Record, step: int, source: Source
-    ) -> tuple[dict[str, Any], Record]:
-        """Return the request for a measurement, and the record with the case's data."""
-        request = {
-            "out": str(self._point),
-            "source": source,
-            **({"step": step} if block.is_sequence else {}),
-        }
+    def _measure(
+        self, block: WorkUnit, turn: tuple[Record, ...], step: int, source: Source
+    ) -> Result:
+        """Measure one solver on one case, and evaluate its answer."""
+        record = turn[step]
+        request: dict[str, Any] = {"out": str(self._point), "source": source}
+        if block.is_sequence:
+            request["step"] = step
         if source.is_shared:
             request |= case_request(record)
-        if source is Source.RANKS:
-            return request, record
-        entry = self._entries[step]
-        if not source.is_shared:
-            request |= {"qp": str(entry.qp), "digest": entry.digest}
-        keys = ("qp", "build_seconds", "dualise_seconds")
-        meta = {key: entry.meta.get(key) for key in keys}
-        return request, record.replace(**meta)
+        if source is not Source.RANKS:
+            entry = self._entries[step]
+            keys = ("qp", "build_seconds", "dualise_seconds")
+            record = record.replace(**{key: entry.meta.get(key) for key in keys})
+            if not source.is_shared:
+                request |= {"qp": str(entry.qp), "digest": entry.digest}
+
+        def whole() -> QP:
+            self._build(turn)
+            return self._qp(self._entries[step])
+
+        record, solution, needs_evaluation = measure_and_judge(
+            self._worker(record.solver),
+            whole,
+            record,
+            request,
+            time_limit=block.time_limit,
+            memory_limit=block.memory_limit,
+        )
+        if record.status in (Verdict.CRASHED, Verdict.FAILED):
+            refuse_full_disk(self.scratch, "")  # a full disk may be the cause
+        if solution is None or not has_point(solution):
+            return Result(record=record)
+        if needs_evaluation:
+            return self._describe(record, solution)
+        return Result(record=record, point=point_arrays(solution))
 
     def _source(self, record: Record) -> Source:
         """Return the origin of a record's QP."""
@@ -185,7 +191,7 @@ class Executor:
             return Source.FILE
         return Source.RANKS if self.commands.own_code_only else Source.SHARES
 
-    def _build(self, block: WorkUnit, turn: tuple[Record, ...]) -> None:
+    def _build(self, turn: tuple[Record, ...]) -> None:
         """Build the cases of the current block, unless they are already built.
 
         If a sequence ends before the last step of `turn`, fewer cases are built.
@@ -196,7 +202,7 @@ class Executor:
         self._end_reason = ""
         for record in turn:
             try:
-                entries.append(self._entry(record, block))
+                entries.append(self._entry(record))
             except _BuildError as e:
                 if not entries or not e.past_end:
                     raise
@@ -205,12 +211,8 @@ class Executor:
         self._entries = tuple(entries)
         self._loaded = {e.digest: self._qp(e) for e in entries}
 
-    def _describe(
-        self, block: WorkUnit, record: Record, solution: Solution | None
-    ) -> Result:
+    def _describe(self, record: Record, solution: Solution) -> Result:
         """Add physical quantities and error bounds, computed by the case worker."""
-        if solution is None or not has_point(solution):
-            return Result(record=record)
         first = record.status is Verdict.VERIFIED and record.repeat == 0
         fields = self.scratch / "fields.npz"
         fields.unlink(missing_ok=True)
@@ -221,7 +223,7 @@ class Executor:
         }
         notes: list[str]
         try:
-            answer = self._ask_case_worker(request, block)
+            answer = self._ask_case_worker(request)
             notes = answer["notes"]
             record = record.replace(
                 quantities=answer["quantities"],
@@ -235,19 +237,17 @@ class Executor:
             record=noted(record, *notes), point=point_arrays(solution), fields=stored
         )
 
-    def _entry(self, record: Record, block: WorkUnit) -> StoredCase:
+    def _entry(self, record: Record) -> StoredCase:
         def make(path: Path) -> Mapping[str, Any]:
             request = {"build": _case(record), "qp": str(path)}
-            meta: Mapping[str, Any] = self._ask_case_worker(request, block)["meta"]
+            meta: Mapping[str, Any] = self._ask_case_worker(request)["meta"]
             return meta
 
         r = record
         identity = [r.family, r.params, r.form, r.environment]
         return find_or_build(self.cases, identity, make)
 
-    def _ask_case_worker(
-        self, request: Mapping[str, Any], block: WorkUnit
-    ) -> Mapping[str, Any]:
+    def _ask_case_worker(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         """Send a request to build or to evaluate a case, and return the answer.
 
         Raises
@@ -262,7 +262,7 @@ class Executor:
         # may have crashed it
         for _ in range(2):
             reply = self._case_worker.ask(
-                {**request, "keep": len(block.cases)},
+                {**request, "keep": self._keep},
                 time_limit=inf,
                 memory_limit=inf,
             )
@@ -312,16 +312,6 @@ def execute(
     with closing(Executor(commands, scratch, cases, operators)) as executor:
         for block in blocks:
             yield from executor.execute(block)
-
-
-def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
-    """Yield results for the steps `rest` after the end of their sequence.
-
-    Each of these results has the verdict of `end`, the record that ended the sequence.
-    """
-    for record in rest:
-        reason = f"the sequence ended at {end.case}: {end.message}"
-        yield Result(record=record.replace(status=end.status, message=reason))
 
 
 class _BuildError(Exception):

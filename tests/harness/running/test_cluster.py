@@ -495,7 +495,7 @@ def meet():
     def meet(change):
         there = json.loads(json.dumps(here))
         change(there)
-        connection.add_node("node07", digest(there), there)
+        connection.add_node("node07", there)
         return kept, said
 
     return meet

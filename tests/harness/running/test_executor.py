@@ -4,7 +4,7 @@ import pytest
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.processes.supervisor import Reply
-from mortarbench.harness.results.work_unit import Commands, WorkUnit
+from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.executor import Executor, _BuildError
 from tests.support.box_records import box_record
 
@@ -26,9 +26,8 @@ class DeadCaseWorker:
 def test_the_message_names_the_case_and_the_request(tmp_path, request_key, message):
     executor = Executor(Commands(solvers={}, case_worker=[]), tmp_path, tmp_path)
     executor._case_worker = DeadCaseWorker()
-    steps = tuple(box_record("smalbe", n, mode="sequence") for n in (1, 2))
-    block = WorkUnit(number=0, turns=(steps,), time_limit=1.0, memory_limit=1.0)
+    case = box_record("smalbe", 2).case
 
     with pytest.raises(_BuildError) as error:
-        executor._ask_case_worker({request_key: {"name": steps[1].case}}, block)
+        executor._ask_case_worker({request_key: {"name": case}})
     assert error.value.reason == message
