@@ -76,7 +76,7 @@ def merge(
     folders = [*[out] * journal.exists(), *journals]
     paths = {str(folder): folder / "suite.toml" for folder in folders}
     suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
-    suite = as_toml(unite(suites))
+    suite = as_toml(unite(suites)) if suites else ""
     with report_full_disk(out), lock_folder(out):
         merged = _united(
             {
@@ -94,7 +94,8 @@ def merge(
                     "vectors/"
                 )
         _copy_environments(folders, out, merged, tell)
-        replace_file(out / "suite.toml", suite.encode())
+        if suite:  # folders without suites may be merged as well
+            replace_file(out / "suite.toml", suite.encode())
         lines = "".join(f"{r.to_json()}\n" for r in merged)
         replace_file(journal, lines.encode())
     return merged

@@ -73,8 +73,6 @@ def unite(suites: Mapping[str, SuiteFile]) -> dict[str, Any]:
     """
     for (one, a), (other, b) in combinations(suites.items(), 2):
         _refuse_unequal(one, a, other, b)
-    if not suites:
-        return {}
     merged = {
         key: tuple(e for i, e in enumerate(entries) if e not in entries[:i])
         for key in ("tolerances", "solvers", "problems")

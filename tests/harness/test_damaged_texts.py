@@ -79,7 +79,6 @@ plane = "strain"
 contact = "nts"
 basis = "dual"
 steps = 10
-relin = 1
 units = { length = 2.0, force = 1e8 }
 [[bodies]]
 name = "low"

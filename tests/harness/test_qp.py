@@ -200,6 +200,7 @@ def test_a_semidefinite_matrix_is_convex_up_to_rounding():
 def test_the_examples_of_docstrings_print_the_output_shown(module):
     result = doctest.testmod(
         import_module(f"mortarbench.harness.{module}"),
+        globs={"__name__": "builtins"},  # as in a session, not in the module
         optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE,
     )
 

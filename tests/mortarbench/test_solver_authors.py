@@ -28,7 +28,7 @@ TOY = load_plugin(TOY_PROBLEM)
 #: solver that is correct only in the second version; the versions differ in `step`
 MINE = """
 from dataclasses import dataclass
-from harness import Solution, Status
+from mortarbench import Solution, Status
 import step
 
 @dataclass(frozen=True)

@@ -362,8 +362,7 @@ def test_an_unbalanced_load_is_refused_as_for_undivided_bodies(
     sign: int, push: float, reason: str
 ) -> None:
     parts = disc_in_parts(push=push)
-    load = parts.load
-    parts = replace(parts, load=lambda at: sign * load(at))
+    parts = replace(parts, load=sign * parts.load)
     whole = disc_between_plates(push=push).mechanics
     assert whole is not None
     whole = replace(whole, primal=replace(whole.primal, q=sign * whole.primal.q))

@@ -33,8 +33,8 @@ POINT = Solution(
 
 
 def record(tol=1e-8, options=None, *, case="f/p", solver="s", spec=None, **changes):
-    family = SimpleNamespace(name="f")
-    name = CaseId(family=family, name=case, params={"n": 1}, form="p")
+    family = SimpleNamespace(params={"n": 1})
+    name = CaseId(family=family, name=case, form="p")
     spec = SolverSpec(name=solver, label=solver, **spec or {})
     return new_record(
         name, spec, options=options or {}, tol=tol,

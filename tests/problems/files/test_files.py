@@ -795,7 +795,7 @@ def test_a_run_does_not_continue_with_a_changed_file(written, command, tmp_path)
 
     assert code == 2
     assert re.fullmatch(
-        r"mortarbench: out contains file:a\.qps with sha256 = \w{12}, now \w{12}; "
+        r"mortarbench: --out contains file:a\.qps with sha256 = \w{12}, now \w{12}; "
         r"choose another --out or use --fresh\n",
         err.splitlines(keepends=True)[-1],
     )
