@@ -153,7 +153,8 @@ class Pools(Honest):
     """Solver that leaves a sleeping thread behind."""
 
     def act(self, qp):
-        threading.Thread(target=time.sleep, args=[3600], daemon=True).start()
+        if threading.active_count() < 3:  # stacks of more threads exceed the limit
+            threading.Thread(target=time.sleep, args=[3600], daemon=True).start()
         return replace(at_the_row(qp), counts={"process": os.getpid()})
 
 
