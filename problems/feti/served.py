@@ -120,17 +120,6 @@ class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no typ
         self._served.lead("operator.prepare")
         return self
 
-    def bulk(self, u: Vector) -> tuple[float, Vector]:
-        """Return ½uᵀKu − fᵀu and the largest stress (bodies,) of each body, Pa.
-
-        u : (n,) nondimensional displacement
-        """
-        assert self.stresses is not None
-        v, comm = self.parts.spread @ u, self.torn.comm
-        energy = float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
-        largest = comm.gather(comm.together(partial(self.stresses, u)))
-        return energy, np.max(largest, axis=0) if largest else np.zeros(0)
-
     def forget(self) -> None:
         """Discard all factors; the next product computes them again."""
         self._served.lead("forget")
