@@ -45,9 +45,9 @@ class NewtonFamily(Family):
         if hasattr(p, "step") and p.step > p.steps:
             raise InputError(f"step={p.step} must be at most steps={p.steps}")
 
+    @abstractmethod
     def newton_path(self, reference: Reference) -> NewtonPath:
         """Return the path of Newton iterations."""
-        raise NotImplementedError
 
     def newton_results(
         self, path: NewtonPath, at: Iteration, s: Solution
@@ -73,7 +73,8 @@ class NewtonFamily(Family):
 class ContactFamily(NewtonFamily):
     """A family of elastic bodies in contact, defined by a `ContactProblem`.
 
-    A family with the key `kinematics` also defines `finite_bodies` or `newton_path`.
+    A family with the key `kinematics` also defines `finite_bodies`, which returns the
+    assembled bodies for finite strain, or `newton_path`.
     """
 
     def __post_init__(self) -> None:
@@ -95,14 +96,10 @@ class ContactFamily(NewtonFamily):
     def problem(self) -> ContactProblem:
         """Return the bodies with supports, loads, contact and quantities."""
 
-    def finite_bodies(self) -> Bodies:
-        """Return the assembled bodies for finite strain."""
-        raise NotImplementedError
-
     def newton_path(self, reference: Reference) -> NewtonPath:
         """Return the path of Newton iterations at finite strain."""
         p: Any = self
-        bodies = self.finite_bodies()
+        bodies: Bodies = p.finite_bodies()
         return newton_path(
             bodies,
             linearisation(bodies, p.contact, p.basis),

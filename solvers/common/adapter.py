@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -91,7 +92,7 @@ class Adapter:
         return settings
 
 
-class SequenceAdapter(Adapter):
+class SequenceAdapter(Adapter, ABC):
     """Adapter of a library whose solver objects can be updated for a sequence."""
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -100,5 +101,5 @@ class SequenceAdapter(Adapter):
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         return chain(self._begin, tol)
 
-    def _begin(self, qp: QP, tol: float) -> Session:
-        raise NotImplementedError
+    @abstractmethod
+    def _begin(self, qp: QP, tol: float) -> Session: ...
