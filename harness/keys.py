@@ -56,6 +56,16 @@ class Range:
     def __contains__(self, value: float) -> bool:
         return self.least <= value <= self.most
 
+    def require(self, name: str, value: float) -> None:
+        """Raise InputError unless a value is in the range.
+
+        name : key of the value, for the message
+        """
+        if value not in self:
+            is_positive = value <= 0 < self.least < 1
+            expected = "positive" if is_positive else str(self)
+            raise InputError(f"{name}={value} must be {expected}")
+
     def __str__(self) -> str:
         if self.most == math.inf:
             return f"at least {self.least:g}"
@@ -120,8 +130,8 @@ class Key:
         if self.choices and value not in self.choices:
             expected = " or ".join(map(repr, self.choices))
             raise InputError(f"{self.name}={value!r} is unknown, expected {expected}")
-        if self.kind is not str and value not in self.range:
-            raise InputError(f"{self.name}={value} must be {self.range}")
+        if self.kind is not str:
+            self.range.require(self.name, value)
 
 
 @cache

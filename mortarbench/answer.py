@@ -350,7 +350,8 @@ def solve(
         from mortarbench.verification import remarks
 
         spec = with_history(spec, solvers)
-        default = with_history(SolverSpec(name=name, label=name), solvers)
+        plain = SolverSpec(name=name, label=name)
+        default = plain if "history" in requested else with_history(plain, solvers)
         record = new_record(
             problem.id,
             spec,

@@ -228,8 +228,7 @@ class HertzCylinder(ContactFamily):
                         "no peak"
                     )
             check_tangential(self)
-            if self.mu not in POSITIVE:
-                raise InputError(f"mu={self.mu} must be {POSITIVE}")
+            POSITIVE.require("mu", self.mu)
         if self.loading == "static" and self.Q != self.peak:
             raise InputError(
                 f"peak={self.peak} is not used by loading=static; expected "

@@ -290,7 +290,7 @@ def test_impossible_cases_are_refused_with_a_short_message(name):
 
 
 def test_minus_zero_is_zero():
-    with pytest.raises(InputError, match=r"load=0\.0 must be between"):
+    with pytest.raises(InputError, match=r"load=0\.0 must be positive"):
         parse("hertz-plane/load=-0/dual", PROBLEMS)
     assert "-" not in str(parse("hertz-plane/n=+7/dual", PROBLEMS))[11:]
 

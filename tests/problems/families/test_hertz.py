@@ -176,9 +176,9 @@ def test_errors_on_fine_meshes_are_those_of_finite_bodies(n):
     ("family", "bad", "message"),
     [
         (PLANE, {"n": 0}, "n=0 must be at least 1"),
-        (PLANE, {"load": -1.0}, "load=-1.0 must be between 1e-30 and"),
+        (PLANE, {"load": -1.0}, "load=-1.0 must be positive"),
         (CYLINDER, {"m": 0}, "m=0 must be at least 1"),
-        (CYLINDER, {"ratio": 0.0}, "ratio=0.0 must be between 1e-30 and"),
+        (CYLINDER, {"ratio": 0.0}, "ratio=0.0 must be positive"),
         (CYLINDER, {"contact": "glue"}, "contact='glue' is unknown"),
     ],
 )
@@ -319,7 +319,7 @@ def test_friction_holds_equal_cylinders_together_without_a_force():
     [("Q=0.5", "friction=none is not supported with a tangential force"),
      ("friction=tresca/bound=1e6/Q=0.5", "expected friction=coulomb, or no Q"),
      ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a fraction of μP"),
-     ("friction=coulomb/mu=0/Q=0.5", "mu=0.0 must be between 1e-30 and"),
+     ("friction=coulomb/mu=0/Q=0.5", "mu=0.0 must be positive"),
      ("friction=coulomb/mu=0.3/Q=0.6/peak=0.4", "must be between -peak and peak=0.4"),
      ("friction=coulomb/mu=0.3/Q=0.5/ratio=2", "expected ratio=1.0, or no Q"),
      ("friction=coulomb/mu=0.3/programme=proportional", "proportional requires Q > 0"),
