@@ -52,8 +52,8 @@ def solve(
     """
     files = {"plot": plot, "vtu": vtu, "out": out}
     _check_files(files, scale)
-    problem = as_case(case, registries=registries)
     check_name(solver, registries.solvers)
+    problem = as_case(case, registries=registries)
     options = options_for(solver, option, registries.solvers)
     pictures = [f"--{name}" for name in ("plot", "vtu") if files[name] is not None]
     if pictures and problem.family_case.fields is None:

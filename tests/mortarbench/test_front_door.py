@@ -236,6 +236,8 @@ LIGHT = [
     ["--version"],
     ["list", "suites"],
     ["solve", "beam-rin/dual", "--solver", "smalbe"],
+    ["solve", "beam-ring/dual", "--solver", "smalb"],
+    ["solve", "beam-ring/dual", "--solver", "smalbe", "--plot", "a.txt"],
     ["run", "dem"],
     ["report", "nowhere"],
     ["validate", "nowhere"],
