@@ -169,23 +169,14 @@ class Answer:
         >>> figure = answer.plot()
 
         """
-        from mortarbench.reports.figures.deformed import deformed_figure
-        from mortarbench.reports.figures.maps import traction_maps
-        from mortarbench.reports.figures.tractions import traction_figure
-        from mortarbench.reports.render.saving import draw, save
+        from mortarbench.reports.figures.bodies import fields_figure
+        from mortarbench.reports.figures.style import save
 
         fields = self.fields()
-        drawn = None if scale is None else check_scale(scale)
-        figure = (
-            deformed_figure(fields, drawn)
-            if len(fields.cells)
-            else traction_figure(fields) or traction_maps(fields)
-        )
-        if figure is None:
-            raise InputError("no picture: the case has neither bodies nor tractions")
-        if path is None:
-            return draw(figure)
-        return save(figure, checked.output_file(path, PICTURES))
+        figure = fields_figure(fields, None if scale is None else check_scale(scale))
+        if path is not None:
+            save(figure, checked.output_file(path, PICTURES))
+        return figure
 
     def save(self, path: str | Path) -> Path:
         """Write x, y, z and z_box and, for bodies, displacements to an npz file.

@@ -17,6 +17,7 @@ from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.plugin import Family, Reference, Solver
 from mortarbench.harness.processes.locks import ForkSafeLock
+from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.harness.registry import (
     Plugin,
     PluginFile,
@@ -57,13 +58,10 @@ class Reporter(Protocol):
         formats: Sequence[str],
         *,
         factor: float = ...,
-        pool_forms: bool = ...,
     ) -> list[Path]:
         """Write the report.
 
         factor : a point is verified if every residual is at most factor·tol
-        pool_forms : compare solvers over the cases of all forms together, instead of
-            within each form
         """
 
 
@@ -134,25 +132,19 @@ def reference(qp: QP) -> Solution:
 
 
 def report_folder(
-    folder: Path,
-    formats: Sequence[str],
-    *,
-    factor: float | None = None,
-    pool_forms: bool = False,
+    folder: Path, formats: Sequence[str], *, factor: float = VERIFIED_FACTOR
 ) -> list[Path]:
     """Write the built-in report on a result folder and return the files."""
-    from mortarbench.harness.record import VERIFIED_FACTOR
-    from mortarbench.reports import write_report
+    from mortarbench.reports.folder import write_report
 
-    factor = VERIFIED_FACTOR if factor is None else factor
-    return write_report(folder, formats, factor, pool_forms=pool_forms)
+    return write_report(folder, formats, factor)
 
 
 ValidationPage: TypeAlias = Callable[[Path, Mapping[str, Any]], list[Path]]
 
 
 def _validation_page(folder: Path, data: Mapping[str, Any]) -> list[Path]:
-    from mortarbench.reports.validation.report import write_validation
+    from mortarbench.reports.validation import write_validation
 
     return write_validation(folder, data)
 

@@ -1,7 +1,8 @@
-"""Reports on a result folder, and on the changes between result folders."""
+"""Reports on a result folder, and on changes between result folders or solvers."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -10,19 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from mortarbench.harness import checked
-from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.registries import Registries, load_registries, report_folder
 
 if TYPE_CHECKING:
-    from mortarbench.harness.running.pairs import Ratio
-    from mortarbench.reports.compare.changes import Comparison, Pair
-    from mortarbench.reports.compare.regressions import Slower
-
+    from mortarbench.reports.compare import Change
+    from mortarbench.reports.measurements import Measurements
 
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: formats of a report
-GATES = ("worse", "slower")  #: values allowed in the argument `fail_on` of `report`
+SLOWER = 1.2  #: factor from which on a solver counts as slower, unless one is given
+_GATE = re.compile(r"worse|slower(?:=(?P<factor>[0-9.]+))?")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,10 +31,15 @@ class Report:
 
     files: tuple[Path, ...]
     said: tuple[str, ...] = ()  #: main statements, one line each
-    #: changes from the first folder to each of the others: the plain data that
-    #: ``report --json`` prints
+    #: changes of the solvers: the plain data that ``report --json`` prints
     changes: tuple[dict[str, Any], ...] = ()
     failed_on: tuple[str, ...] = ()  #: conditions of `fail_on` that are met
+    undecided: bool = False  #: True if a condition of `fail_on` cannot be decided
+
+    @property
+    def code(self) -> int:
+        """Exit code: 1 if a condition is met, 2 if one cannot be decided, else 0."""
+        return 1 if self.failed_on else 2 if self.undecided else 0
 
     @property
     def page(self) -> Path | None:
@@ -47,6 +52,7 @@ class Report:
             "said": [*self.said],
             "changes": [*self.changes],
             "failed_on": [*self.failed_on],
+            "undecided": self.undecided,
             "files": [*map(str, self.files)],
         }
 
@@ -66,11 +72,12 @@ def report(
     *others: Annotated[str | Path | None, "DIR2"],
     formats: Annotated[Sequence[str], "--format html,md,tex,csv,parquet"] = FORMATS,
     factor: Annotated[float, "F"] = VERIFIED_FACTOR,
-    fail_on: Annotated[Sequence[str], "worse,slower"] = (),
-    pool_forms: bool = False,
+    fail_on: Annotated[Sequence[str], "worse,slower=1.2"] = (),
+    compare: Annotated[Sequence[str], "OLD,NEW"] = (),
+    pair: Annotated[Sequence[str], "A=B"] = (),
     registries: Registries | None = None,
 ) -> Report:
-    """Write a report on a result folder, or on the changes from it to other folders.
+    """Write a report on a result folder, or on changes.
 
     Parameters
     ----------
@@ -79,20 +86,17 @@ def report(
         DIR2/report/against-DIR. The report on `folder` is then not written
     formats : formats to write; default: all
     factor : an answer is verified if every residual is at most F times the tolerance
-    fail_on : exit with 1 if, from DIR to DIR2, a verdict became worse (worse) or a
-        solver became slower by the criterion in docs/statistics-growth.md (slower). In
-        Python, `Report.failed_on` lists the conditions that are met
-    pool_forms : compute means, rankings and profiles over the cases of all forms
-        together, where a declined form counts as unsolved, not within each form
+    fail_on : exit with 1 if a verdict became worse (worse), or if a solver became
+        slower by the given factor (slower=1.2), and with 2 if this cannot be told
+    compare : report the change from the solver OLD to the solver NEW in DIR
+    pair : compare the solver A of DIR with the solver B of DIR2
     registries : used instead of the built-in registries, for the function that writes
         the report
 
     Raises
     ------
     InputError
-        If a folder contains no measurements, a format or the factor is invalid,
-        `pool_forms` is requested for a comparison, or it cannot be decided whether
-        a condition in `fail_on` is met.
+        If a folder contains no measurements, or an argument is invalid.
 
     Examples
     --------
@@ -103,113 +107,157 @@ def report(
 
     """
     formats = checked.names("formats", "format", formats, FORMATS)
-    fail_on = checked.names("fail_on", "gate", fail_on, GATES)
+    gates = _gates(fail_on)
     factor = checked.positive("factor", factor)
-    pool_forms = checked.flag("pool_forms", pool_forms)
     registries = load_registries((), Registries() if registries is None else registries)
-    if fail_on and not any(others):
-        raise InputError("fail_on needs a second folder; expected report DIR DIR2")
     first = checked.result_folder("folder", folder)
     after = [checked.result_folder("others", o) for o in others if o is not None]
-    if not after:
-        write = registries.report
-        with report_full_disk(first):
-            files = write(first, formats, factor=factor, pool_forms=pool_forms)
-        if write is not report_folder:  # `answer` summarises only the built-in report
-            return Report(files=tuple(files))
-        from mortarbench.reports import answer
-
-        return Report(files=tuple(files), said=tuple(answer(first, factor)))
-    if pool_forms:
-        raise InputError(
-            "--pool-forms applies to the report on one folder, not to a comparison of "
-            "two folders, which pairs equal cases; omit it or the second folder"
-        )
-    from mortarbench.reports import write_comparisons
+    if not (after or compare):
+        if gates or pair:
+            raise InputError(
+                "fail_on and pair need two folders, or two solvers; expected "
+                "report DIR DIR2, or report DIR --compare OLD,NEW"
+            )
+        return _report(registries, first, formats, factor)
+    from mortarbench.reports.measurements import read_measurements
 
     with ExitStack() as stack:
+        stack.enter_context(report_full_disk(first))
+        before = read_measurements(first, factor)
+        if compare:
+            old, new = _two(checked.texts("compare", compare), "compare")
+            pairs = [(_solver(before, old), _solver(before, new))]
+            target = first / "report" / "compared"
+            return _changes(before, before, pairs, target, formats, gates)
+        found = []
         for one in after:
             stack.enter_context(report_full_disk(one))
-        comparisons, said, pages = write_comparisons(first, after, formats, factor)
-    changes = tuple(map(_comparison_data, comparisons))
-    failed = [what for what in fail_on if any(change[what] for change in changes)]
-    undecided = _undecided(changes, fail_on)
-    if undecided and not failed:
-        raise InputError(undecided[0])
+            other = read_measurements(one, factor)
+            target = one / "report" / f"against-{first.resolve().name}"
+            pairs = _pairs(before, other, pair)
+            found.append(_changes(before, other, pairs, target, formats, gates))
     return Report(
-        files=tuple(pages),
-        said=(*said, *undecided),
-        changes=changes,
-        failed_on=tuple(dict.fromkeys(failed)),
+        files=tuple(file for r in found for file in r.files),
+        said=tuple(line for r in found for line in r.said),
+        changes=tuple(change for r in found for change in r.changes),
+        failed_on=tuple(dict.fromkeys(what for r in found for what in r.failed_on)),
+        undecided=any(r.undecided for r in found),
     )
 
 
-def _undecided(changes: Sequence[dict[str, Any]], fail_on: Sequence[str]) -> list[str]:
-    """Return the reasons why conditions in `fail_on` cannot be decided, if any."""
-    lines = []
-    for change in changes if fail_on else ():
-        between = f"{change['before']} and {change['after']}"
-        if not change["cells"]:
-            lines.append(
-                f"fail-on {','.join(fail_on)}: no cell (a solver on a case at a "
-                f"tolerance) is in both {between}; expected two runs of one suite"
+def _report(
+    registries: Registries, folder: Path, formats: Sequence[str], factor: float
+) -> Report:
+    """Write the report of a folder, by the function of the registries."""
+    with report_full_disk(folder):
+        files = registries.report(folder, formats, factor=factor)
+    if registries.report is not report_folder:  # the sentences are of the built-in one
+        return Report(files=tuple(files))
+    from mortarbench.reports.folder import sentences
+    from mortarbench.reports.measurements import read_measurements
+
+    said = sentences(read_measurements(folder, factor))
+    return Report(files=tuple(files), said=tuple(said))
+
+
+def _gates(fail_on: Sequence[str]) -> dict[str, float]:
+    """Return the conditions by name, with the factor of `slower`."""
+    gates = {}
+    for text in checked.texts("fail_on", fail_on):
+        match = _GATE.fullmatch(text)
+        limit = float(match["factor"] or SLOWER) if match else 0.0
+        if limit <= 1:
+            raise InputError(
+                f"fail_on: {shown(text)}; expected worse, slower, or slower=FACTOR "
+                "with a factor above 1"
             )
-        elif "slower" in fail_on and (why := change["slower_not_judged"]):
-            lines.append(f"fail-on slower: {between}: {why}")
-    return lines
+        gates[text.partition("=")[0]] = limit
+    return gates
 
 
-def _comparison_data(c: Comparison) -> dict[str, Any]:
-    """Return the changes between two folders as plain data."""
-    from mortarbench.reports.compare.changes import mean_ratio
-    from mortarbench.reports.compare.regressions import regressions
+def _two(names: Sequence[str], what: str) -> tuple[str, str]:
+    if len(names) != 2:
+        raise InputError(f"{what} = {shown([*names])}; expected two labels, OLD,NEW")
+    return names[0], names[1]
 
-    judged = regressions(c)
-    means = {s: mean for s in c.solvers if (mean := mean_ratio(c.of(s)))}
+
+def _solver(run: Measurements, label: str) -> str:
+    if label not in run.solvers:
+        raise unknown("solver", label, run.solvers, where=str(run.folder))
+    return label
+
+
+def _pairs(
+    before: Measurements, after: Measurements, pair: Sequence[str]
+) -> list[tuple[str, str]]:
+    """Return the pairs of labels to compare: those of `pair`, or all common ones."""
+    pairs = []
+    for text in checked.texts("pair", pair):
+        # labels contain "=", so that the text is split where both parts are labels
+        cuts = [m.start() for m in re.finditer("=", text)]
+        splits = [(text[:i], text[i + 1 :]) for i in cuts]
+        fits = [s for s in splits if s[0] in before.solvers and s[1] in after.solvers]
+        if not fits:
+            raise InputError(
+                f"pair = {shown(text)}; expected A=B, where A is one of "
+                f"{', '.join(before.solvers)}, and B one of {', '.join(after.solvers)}"
+            )
+        pairs.append(fits[0])
+    common = [(s, s) for s in before.solvers if s in after.solvers]
+    if not (pairs or common):
+        raise InputError(
+            f"{before.folder} and {after.folder} have no solver in common; expected "
+            "runs of one suite, or pair = A=B"
+        )
+    return pairs or common
+
+
+def _changes(
+    before: Measurements,
+    after: Measurements,
+    pairs: Sequence[tuple[str, str]],
+    target: Path,
+    formats: Sequence[str],
+    gates: dict[str, float],
+) -> Report:
+    """Compare, write the page, and judge the conditions `gates`."""
+    from mortarbench.reports import comparison
+    from mortarbench.reports.compare import Outcome, compare
+
+    limit = gates.get("slower", SLOWER)
+    changes = compare(before, after, pairs)
+    said = [
+        comparison.conditions(before, after, pairs),
+        *comparison.sentences(changes, limit),
+    ]
+    title = f"{before.name} to {after.name}"
+    if before is after:
+        title = f"{pairs[0][0]} to {pairs[0][1]} in {before.name}"
+    files = comparison.write_comparison(target, title, changes, said, formats)
+    outcomes = [change.outcome(limit) for change in changes]
+    failed = ["slower"] * ("slower" in gates and Outcome.SLOWER in outcomes)
+    failed += ["worse"] * ("worse" in gates and any(len(c.worse) for c in changes))
+    return Report(
+        files=tuple(files),
+        said=tuple(said),
+        changes=tuple(_data(change, limit) for change in changes),
+        failed_on=tuple(failed),
+        undecided="slower" in gates and Outcome.CANNOT_TELL in outcomes,
+    )
+
+
+def _data(change: Change, limit: float) -> dict[str, Any]:
+    """Return the change of a solver as plain data."""
+    ratio = change.ratio
     return {
-        "before": str(c.before.directory),
-        "after": str(c.after.directory),
-        "cells": len(c.pairs),
-        "only_before": len(c.only_before),
-        "only_after": len(c.only_after),
-        "same_machine": all(p.same_machine for p in c.pairs),
-        "worse": [_verdicts(p) for p in c.worse],
-        "better": [_verdicts(p) for p in c.pairs if p.turn < 0],
-        "other_answers": [_cell(p) for p in c.pairs if p.other_answer],
-        "slower": [_slower(one) for one in judged.slower],
-        "slower_judged": {"solvers": judged.solvers, "cells": judged.cells},
-        "slower_not_judged": judged.why_not or None,
-        "slower_unverified": list(judged.unverified),
-        "ratios": {
-            s: _interval(mean) | {"cells": mean.cells} for s, mean in means.items()
-        },
-    }
-
-
-def _cell(p: Pair) -> dict[str, Any]:
-    return {"case": p.after.case, "solver": p.after.solver, "tol": p.after.tol}
-
-
-def _verdicts(p: Pair) -> dict[str, Any]:
-    verdicts = {"before": p.before.verdict.value, "after": p.after.verdict.value}
-    return _cell(p) | verdicts
-
-
-def _slower(one: Slower) -> dict[str, Any]:
-    return {
-        "solver": one.solver,
-        "case": one.case or None,
-        "tol": one.tol,
-        "ratio": _interval(one.ratio),
-        "relative": _interval(one.relative),
-    }
-
-
-def _interval(ratio: Ratio | Any) -> dict[str, float | None]:
-    """Return a ratio with the ends of its interval, which are None if undefined."""
-    bounded = 0 < ratio.low <= ratio.high < float("inf")
-    return {
-        "value": ratio.value,
-        "low": ratio.low if bounded else None,
-        "high": ratio.high if bounded else None,
+        "before": change.before,
+        "after": change.after,
+        "outcome": change.outcome(limit).name.lower(),
+        "limit": limit,
+        "ratio": ratio and ratio.value,
+        "low": ratio.low if ratio and ratio.is_known else None,
+        "high": ratio.high if ratio and ratio.is_known else None,
+        "cells": change.cells,
+        "repeats": change.repeats,
+        "worse": change.worse[["case", "tol", "old", "new"]].to_dict("records"),
     }

@@ -123,34 +123,48 @@ class Results:
         """Write the report; see `mortarbench.report`."""
         return report(self.folder, **options)  # type: ignore[arg-type]
 
-    def plot(self, kind: str, path: str | Path | None = None) -> Figure:
+    def plot(
+        self,
+        kind: str,
+        path: str | Path | None = None,
+        *,
+        x: str | None = None,
+        solvers: Sequence[str] = (),
+        cases: Sequence[str] = (),
+    ) -> Figure:
         """Draw a figure of the report.
 
         Parameters
         ----------
         kind : name of the figure in the folder ``figures`` of the report, such as
-            ``accuracy`` or ``scaling-1``. The number can be omitted if there is only
-            one such figure
+            ``accuracy`` or ``scaling``
         path : file to which the figure is also written: .png, .pdf or .svg
+        x : size on the horizontal axis of ``scaling`` and ``iterations``: m, n, or a
+            key of the cases; default: m
+        solvers : labels of the solvers to draw; empty: all
+        cases : names or patterns of the cases to draw; empty: all
 
         Raises
         ------
         InputError
-            If the report has no such figure (the message lists its figures), or the
-            file cannot be written.
+            If the report has no such figure (the message lists its figures), a label is
+            unknown, or the file cannot be written.
 
         """
-        from mortarbench.reports import figures
-        from mortarbench.reports.render.saving import draw, save
+        from mortarbench.reports.figures.style import save
+        from mortarbench.reports.folder import plot
+        from mortarbench.reports.measurements import read_measurements
 
         target = None if path is None else checked.output_file(path, PICTURES)
-        available = figures(self.folder)
-        names = [n for n in available if n.startswith(f"{kind}-")]
-        names = [kind] if kind in available else names
-        if len(names) != 1:
-            raise unknown("figure", str(kind), available, where=str(self.folder))
-        figure = available[names[0]]
-        return draw(figure) if target is None else save(figure, target)
+        run = read_measurements(self.folder)
+        for label in checked.texts("solvers", solvers):
+            if label not in run.solvers:
+                raise unknown("solver", label, run.solvers, where=str(self.folder))
+        run = run.selected(solvers, checked.texts("cases", cases))
+        figure = plot(run, kind, x)
+        if target is not None:
+            save(figure, target)
+        return figure
 
     def validate(self, **options: object) -> Validation:
         """Cross-validate the answers; see `mortarbench.validate`."""

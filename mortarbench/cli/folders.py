@@ -38,7 +38,7 @@ def report(
 ) -> int:
     """Write the report on a result folder, or on changes between result folders.
 
-    Exit code 1: a condition of ``--fail-on`` is met.
+    Exit codes: 1 if a condition of ``--fail-on`` is met, 2 if it cannot be told.
 
     verbose : print the paths of all written files, not only the path of the page
     json : print JSON
@@ -50,7 +50,7 @@ def report(
         paths = result.files if verbose else _main_paths(result.files)
         failed = [f"failed on {', '.join(result.failed_on)}"] * bool(result.failed_on)
         print(*result.said, *paths, *failed, sep="\n")
-    return 1 if result.failed_on else 0
+    return result.code
 
 
 def replay(registries: Registries, *, json: bool = False, **arguments: Any) -> int:

@@ -1,30 +1,35 @@
-"""The journal as a Parquet table with typed columns, for pandas, R, DuckDB etc."""
+"""Measurements as a Parquet table with typed columns, for pandas, R, DuckDB etc."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mortarbench.harness import Record
 from mortarbench.harness.files.durable import replacing
-from mortarbench.harness.results.frame import frame_of, with_texts
+from mortarbench.harness.results.frame import with_texts
 
 #: Parquet types by type of the column; all other columns are text
-_TYPES = {"Int64": pa.int64(), "float64": pa.float64(), "boolean": pa.bool_()}
+_TYPES = {
+    "Int64": pa.int64(),
+    "int64": pa.int64(),
+    "float64": pa.float64(),
+    "boolean": pa.bool_(),
+    "bool": pa.bool_(),
+}
 
 
-def write_records(path: Path, records: Sequence[Record]) -> Path:
-    """Write the table of `harness.results.frame` with a schema that is always equal.
+def write_records(path: Path, df: pd.DataFrame) -> Path:
+    """Write the measurements of a report, with one more column for each key of a case.
 
     The types of columns do not depend on values, so that tables of several result
     folders can be concatenated. Nested values (params, options, counts, quantities, …)
-    are JSON text, since they differ between families and solvers. Equal records yield
+    are JSON text, since they differ between families and solvers. Equal frames yield
     identical bytes.
     """
-    frame = with_texts(frame_of(records))
+    frame = with_texts(with_keys(df))
     table = pa.table(
         {
             name: pa.array(
@@ -37,3 +42,14 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
     with replacing(path) as file:
         pq.write_table(table, file, compression="zstd")
     return path
+
+
+def with_keys(df: pd.DataFrame) -> pd.DataFrame:
+    """Add a column KEY, or key_KEY if the name is taken, for each key of the cases."""
+    keys = pd.DataFrame(list(df.params), index=df.index)
+    for name in keys:
+        values = keys[name]
+        if values.dtype == object and values.dropna().map(type).nunique() > 1:
+            values = values.map(lambda v: None if v is None else str(v))
+        df = df.assign(**{f"key_{name}" if name in df else str(name): values})
+    return df

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mortarbench.harness import ContactSide, Fields, InputError, Vector
 from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.harness.plugin import SLIDING
-from mortarbench.reports.document.fields import (
+from mortarbench.reports.figures.fields import (
     Arrow,
     ColourField,
     ColourScale,
@@ -20,13 +20,13 @@ from mortarbench.reports.document.fields import (
     FieldMark,
     FieldPanel,
     Label,
+    Look,
     Path,
     Points,
     Polygons,
     Strokes,
     Vectors,
 )
-from mortarbench.reports.document.figure import INK, Look
 from mortarbench.reports.figures.projection import (
     Camera,
     camera_above,
@@ -36,6 +36,7 @@ from mortarbench.reports.figures.projection import (
     face_normals,
     visible_faces,
 )
+from mortarbench.reports.figures.style import INK
 
 #: Percentile of the nodal stresses at which the colour scale ends. The maximum is not
 #: used, because stresses may be singular at corners.

@@ -6,17 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import ContactSide, Fields, Vector
-from mortarbench.reports.document.fields import (
+from mortarbench.reports.figures.deformed import length_unit, prefixed
+from mortarbench.reports.figures.fields import (
     ColourScale,
     FieldFigure,
     FieldMark,
     FieldPanel,
+    Look,
     Path,
     Raster,
     Vectors,
 )
-from mortarbench.reports.document.figure import INK, WIDTH, Look
-from mortarbench.reports.figures.deformed import length_unit, prefixed
+from mortarbench.reports.figures.style import INK, WIDTH
 
 _KINDS = ColourScale(
     colours=("#a9cbe6", "#efb0aa"),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
-from mortarbench.reports.document.fields import ColourScale, Faces
+from mortarbench.reports.figures.fields import ColourScale, Faces
 
 Points = NDArray[np.float64]  #: (…, 3)
 Integers = NDArray[np.int64]

@@ -2,59 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from mortarbench.harness import ContactSide, Fields, Vector
-from mortarbench.reports.document.figure import (
-    INK,
-    Axis,
-    Figure,
-    Key,
-    Look,
-    Panel,
-    Row,
-)
 from mortarbench.reports.figures.deformed import FRICTION, length_unit, prefixed
-from mortarbench.reports.figures.style import below, curve, legible
+from mortarbench.reports.figures.style import INK, legend, legible, panels, styled
 
-SHOWN = 1e-6  #: fraction of the largest pressure below which a node counts as unloaded
+SHOWN = 1e-6  #: fraction of the largest traction below which a node counts as unloaded
 BESIDE = 0.15  #: margin on either side, relative to the length of the loaded part
-_EXACT = Look(colour=INK, width=0.9)
-_NODE = Look(colour="#6b7480", marker="o", dash=None, size=3.2)
-#: markers of nodes by friction state; frictionless pairs use the marker of open nodes
-LOOKS = {"open": _NODE} | {
-    state: replace(_NODE, colour=colour, marker=marker)
+#: colour and marker of nodes by friction state; frictionless nodes count as open
+LOOKS = {"open": ("#6b7480", "o")} | {
+    state: (colour, marker)
     for (state, (colour, _)), marker in zip(FRICTION.items(), "so^", strict=True)
 }
 
 
-def traction_figure(fields: Fields) -> Figure | None:
-    """Plot tractions of each loaded contact in one row; None if no contact is loaded.
+def loaded_sides(fields: Fields) -> list[ContactSide]:
+    """Return the contact sides of plane bodies that are under pressure."""
+    sides = fields.contacts if fields.dim == 2 else ()
+    return [side for side in sides if side.pressure.max(initial=0.0) > 0]
 
-    Only plane bodies are supported. Positions are distances from the middle of the
-    undeformed slave side.
+
+def traction_figure(fields: Fields) -> Figure:
+    """Plot the tractions of each loaded contact of plane bodies in one row.
+
+    Positions are distances from the middle of the undeformed slave side.
     """
-    rows, states, exact = list[Row](), set[str](), False
-    for side in fields.contacts if fields.dim == 2 else ():
-        if not side.pressure.max(initial=0.0) > 0:
-            continue
-        rows.append(Row(panels=_panels(fields, side)))
-        states |= set(np.unique(_states(side)).tolist())
-        exact |= side.exact is not None
-    if not rows:
-        return None
-    rough = any(side.friction is not None for side in fields.contacts)
-    keys = [
-        Key(label=state if rough else "nodes", look=style)
-        for state, style in LOOKS.items()
-        if state in states
-    ]
-    keys += [Key(label="exact", look=_EXACT)] * exact
-    return Figure(
-        rows=tuple(rows), height=2.5 * len(rows) + 0.5, legend=below(keys, len(keys))
-    )
+    sides = loaded_sides(fields)
+    columns = 2 if any(side.shear is not None for side in sides) else 1
+    with styled():
+        figure, axes = panels(columns * len(sides), columns=columns, height=2.5)
+        for row, side in enumerate(sides):
+            _draw(axes[columns * row : columns * (row + 1)], fields, side)
+        legend(figure, axes)
+    return figure
 
 
 def places(fields: Fields, side: ContactSide) -> Vector:
@@ -64,16 +47,9 @@ def places(fields: Fields, side: ContactSide) -> Vector:
     return np.asarray(along - along[-1] / 2)
 
 
-def _states(side: ContactSide) -> Vector:
-    if side.friction is None:
-        return np.full(side.nodes.size, "open")
-    return np.where(side.friction == "", "open", side.friction)
-
-
-def _panels(fields: Fields, side: ContactSide) -> tuple[Panel, ...]:
-    """Plot the pressure and, with friction, the shear traction on the loaded part."""
-    along = places(fields, side)
-    tractions = {"pressure": side.pressure}
+def _draw(axes: list[Axes], fields: Fields, side: ContactSide) -> None:
+    """Draw the pressure and, with friction, the shear traction on the loaded part."""
+    along, tractions = places(fields, side), {"pressure": side.pressure}
     if side.shear is not None:
         tractions["shear"] = side.shear
     largest = float(side.pressure.max())
@@ -82,31 +58,27 @@ def _panels(fields: Fields, side: ContactSide) -> tuple[Panel, ...]:
     beyond = BESIDE * (high - low) or float(side.length.max())
     low, high = low - beyond, high + beyond
     size, unit = length_unit(high - low)
-    axis = Axis(
-        label=f"position along the side in {unit}",
-        low=float(low / size),
-        high=float(high / size),
-    )
-    panels = []
+    states = np.full(side.nodes.size, "open")
+    if side.friction is not None:
+        states = np.where(side.friction == "", "open", side.friction)
     for column, (kind, values) in enumerate(tractions.items(), 1):
+        one = axes[column - 1]
         factor, prefix = prefixed(float(abs(values).max()))
-        curves = {}
         if side.exact is not None:
-            curves[_EXACT] = side.exact[:, 0], side.exact[:, column]
-        for state, style in LOOKS.items():
-            of = _states(side) == state
-            curves[style] = along[of], values[of]
-        marks = []
-        for style, (x, y) in curves.items():
-            seen = (low <= x) & (x <= high)
-            points = zip(x[seen] / size, y[seen] / factor, strict=True)
-            marks += curve(points, style)
-        panels.append(
-            Panel(
-                x=axis,
-                y=Axis(label=f"{kind} in {prefix}Pa"),
-                marks=tuple(marks),
-                title=legible(side.name) if column == 1 else "",
-            )
+            one.plot(
+                side.exact[:, 0] / size, side.exact[:, column] / factor,
+                color=INK, lw=0.9, label="exact",
+            )  # fmt: skip
+        for state, (colour, marker) in LOOKS.items():
+            of = (states == state) & (low <= along) & (along <= high)
+            if of.any():
+                one.plot(
+                    along[of] / size, values[of] / factor, marker, ms=3.2,
+                    color=colour, label="nodes" if side.friction is None else state,
+                )  # fmt: skip
+        one.set(
+            xlim=(low / size, high / size),
+            xlabel=f"position along the side in {unit}",
+            ylabel=f"{kind} in {prefix}Pa",
+            title=legible(side.name) if column == 1 else "",
         )
-    return tuple(panels)

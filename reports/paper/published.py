@@ -26,7 +26,6 @@ DOFS = TOTALS[2]
 #: m_E + m_I of this problem, computed here because the paper does not state the numbers
 ROWS = 186 + 181
 SEGMENTS = {"master": 240, "slave": 180}
-FIGURE_2_NODES = 313
 
 ERRATA = (
     "Figure 2: 313 nodes (n = 626) do not agree with the text, which prescribes 2·Nh "

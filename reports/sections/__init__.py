@@ -1,157 +1,84 @@
-"""Sections of a report, each registered with its position by a decorator.
-
-A module NAME.py contains related sections, and NAME.j2 contains their sentences. To add
-a section, write a generator of paragraphs, tables and pictures in any module of this
-package, and decorate it with `@section`.
-"""
+"""Sections of the report: functions of the measurements, in the order of the page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
-from importlib import import_module
-from pkgutil import iter_modules
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from functools import partial
 
-from mortarbench.reports.data.aggregation import Ranking, ranking_of
-from mortarbench.reports.data.comparison_groups import (
-    Answers,
-    ComparisonGroup,
-    all_groups,
-    answers_of,
+from mortarbench.reports.answer import Row, rows, sentence, table
+from mortarbench.reports.document import Document, Item, Picture, Section, clean
+from mortarbench.reports.figures.curves import answer_figure
+from mortarbench.reports.measurements import Measurements
+from mortarbench.reports.sections import routes, setting, solvers
+
+Build = Callable[[Measurements, list[Row]], Iterator[Item]]
+
+#: Name, title and function of each section. A section without items is left out.
+SECTIONS: tuple[tuple[str, str, Build], ...] = (
+    ("outcomes", "Outcomes", solvers.outcomes),
+    ("times", "Times per form", solvers.times),
+    ("mesh", "From the mesh", routes.mesh),
+    ("scaling", "Scaling", solvers.scaling),
+    ("iterations", "Iterations and products", solvers.iterations),
+    ("accuracy", "Accuracy", solvers.accuracy),
+    ("sequences", "Sequences", routes.sequences),
+    ("ranks", "Ranks", routes.ranks),
+    ("physics", "Fields and physics", setting.physics),
+    ("validation", "Cross-validation", setting.crossval),
+    ("settings", "Settings and environment", setting.settings),
+    ("definitions", "Definitions", setting.definitions),
 )
-from mortarbench.reports.data.evidence import Evidence
-from mortarbench.reports.data.fastest import FastestSolver, fastest_solvers
-from mortarbench.reports.data.size_series import SizeSeries, size_series
-from mortarbench.reports.data.ways import Ways, compare_ways
-from mortarbench.reports.document.layout import Part, Section
 
 
-class Analysis:
-    """Evidence from one environment, and derived results that several sections use.
+def compose(run: Measurements) -> Document:
+    """Compose the report: the answer first, then the sections with content.
 
-    pool_forms : compute means, rankings and profiles over the cases of all forms
-        together
+    The measurements of several environments are not compared; each environment has its
+    own answer and sections, under its name.
     """
-
-    def __init__(self, evidence: Evidence, *, pool_forms: bool = False) -> None:
-        self.evidence = evidence
-        self.pool_forms = pool_forms
-
-    @cached_property
-    def sizes(self) -> list[SizeSeries]:
-        """Series of cases that differ only in size."""
-        return size_series(self.evidence)
-
-    @cached_property
-    def forms(self) -> tuple[ComparisonGroup, ...]:
-        """Groups of cases whose times are compared; each group has one form."""
-        return tuple(all_groups(self.evidence))
-
-    @cached_property
-    def pooled(self) -> tuple[ComparisonGroup, ...]:
-        """Groups of cases whose times are compared, all forms pooled."""
-        return tuple(all_groups(self.evidence, pool_forms=True))
-
-    @property
-    def groups(self) -> tuple[ComparisonGroup, ...]:
-        """Groups of cases over which means, rankings and profiles are computed."""
-        return self.pooled if self.pool_forms else self.forms
-
-    @cached_property
-    def ways(self) -> Ways:
-        """Comparison of combinations of form and solver, see `reports.data.ways`."""
-        return compare_ways(self.evidence)
-
-    @cached_property
-    def answers(self) -> Answers:
-        """Answer of every solver to every case, by form, mode and accuracy."""
-        return answers_of(self.evidence)
-
-    @cached_property
-    def fastest(self) -> tuple[FastestSolver, ...]:
-        """Comparisons of solvers, one for each form, mode and accuracy."""
-        return fastest_solvers(self.answers, self.forms)
-
-    @cached_property
-    def rankings(self) -> list[Ranking]:
-        """Rankings of the groups that can be compared over cases."""
-        return [ranking_of(group) for group in self.groups if group.comparable]
+    digests = list(dict.fromkeys(run.df.environment))
+    parts = [run.only(environment=d) for d in digests]
+    sections: list[Section] = []
+    for k, part in enumerate(parts):
+        where = f" ({machine(part, digests[k])})" if len(parts) > 1 else ""
+        ending = f"-{k + 1}" if k else ""
+        found = list(rows(part))
+        sections.append(_answer(part, found, f"answer{ending}", f"Answer{where}"))
+        for name, title, build in SECTIONS:
+            if k and name in ("definitions", "validation"):
+                continue
+            if items := tuple(build(part, found)):
+                sections.append(
+                    Section(name=name + ending, title=title + where, items=items)
+                )
+    started = run.df.started[run.df.started != ""]
+    when = str(started.min())[:10] if len(started) else "date unknown"
+    return Document(
+        title=clean(run.name),
+        dateline=" · ".join([when, *dict.fromkeys(machine(run, d) for d in digests)]),
+        sections=tuple(sections),
+        solvers=run.solvers,
+    )
 
 
-Write = Callable[[Analysis], Iterator[Part]]
-
-
-class _Entry(NamedTuple):
-    place: float
-    compose: Callable[[Analysis], Section | None]
-    needs: str
-
-
-_ENTRIES: list[_Entry] = []
-EVIDENCE = 10  #: sections at smaller positions contain conclusions
-APPENDIX = 90  #: from this position on: conditions and definitions
-COMMON = 94  #: from this position on: the same for all environments
-
-
-def section(
-    place: float, name: str, title: str | Callable[[Analysis], str], needs: str = ""
-) -> Callable[[Write], Callable[[Analysis], Section | None]]:
-    """Register a generator of a section; a section without contents is left out.
-
-    place : sort key of the section; sections are in ascending order of `place`
-    name : anchor, and stem of the section's files
-    needs : title and required measurements, which reports without this section list; a
-        section with empty `needs` is omitted silently
-    """
-
-    def register(write: Write) -> Callable[[Analysis], Section | None]:
-        def compose(analysis: Analysis) -> Section | None:
-            parts = write(analysis)
-            shown = title if isinstance(title, str) else title(analysis)
-            return Section.of(name, shown, parts)
-
-        _ENTRIES.append(_Entry(place, compose, needs))
-        return compose
-
-    return register
-
-
-def sections(*analyses: Analysis) -> Iterator[Section]:
-    """Compose every section for the analysis of each environment.
-
-    Sections with `needs` that no environment has are listed before the appendix.
-    """
-    missing: list[str] = []
-    for entry in _entries():
-        if entry.place >= APPENDIX and missing:
-            prose = (
-                "The following sections are omitted because measurements are missing.",
+def _answer(run: Measurements, found: list[Row], name: str, title: str) -> Section:
+    items: list[Item] = [table(found, run.solvers), *map(sentence, found)]
+    if any(len(row.ranked) > 1 for row in found):
+        items.append(
+            Picture(
+                name=name,
+                caption="Time relative to the fastest solver, with the 95 % interval "
+                "of the table.",
+                draw=partial(answer_figure, found, run.solvers),
             )
-            title = "Not in this report"
-            yield Section(name="absent", title=title, prose=prose, points=(*missing,))
-            missing = []
-        composed = list(_composed(entry, analyses))
-        yield from composed
-        if entry.needs and not composed:
-            missing.append(entry.needs)
+        )
+    return Section(name=name, title=title, items=tuple(items))
 
 
-def opening(analysis: Analysis) -> Iterator[Section]:
-    """Compose the sections with conclusions, which precede the evidence."""
-    for entry in _entries():
-        if entry.place < EVIDENCE:
-            yield from _composed(entry, [analysis])
-
-
-def _composed(entry: _Entry, analyses: Sequence[Analysis]) -> Iterator[Section]:
-    for analysis in analyses[:1] if entry.place >= COMMON else analyses:
-        composed, place = entry.compose(analysis), analysis.evidence.place
-        if composed is not None:
-            yield composed.at(place) if place else composed
-
-
-def _entries() -> list[_Entry]:
-    for module in iter_modules(__path__):
-        import_module(f"{__name__}.{module.name}")
-    return sorted(_ENTRIES, key=lambda entry: entry.place)
+def machine(run: Measurements, digest: str) -> str:
+    """Describe the machine of an environment in a few words."""
+    facts = run.environments.get(digest, {}).get("machine") or {}
+    parts = [str(facts.get("cpu") or "machine unknown")]
+    if facts.get("usable_cores"):
+        parts.append(f"{facts['usable_cores']} cores")
+    return clean(", ".join(parts), 120)

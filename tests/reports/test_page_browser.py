@@ -620,6 +620,7 @@ def hostile(tmp_path_factory):
                     quantities={"dofs": size, text: text}, environment=text,
                     started=text, vectors=text[:20],
                 ))  # fmt: skip
+    (folder / "suite.toml").write_text("name = '''</title><h1>x'''\n")
     return paged(folder)
 
 

@@ -14,7 +14,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 def solved(family, form="dual", **given):
     """Return the deformed state of the reference solution."""
     family = PROBLEMS[family]
-    case = family.with_keys(**given).build(form, reference_solution)
+    case = family.build(form, family.complete(given), reference_solution)
     return case.fields(reference_solution(case.qp))
 
 
@@ -83,7 +83,7 @@ def test_nodes_that_slide_without_contact_have_shear_and_no_pressure():
 def point_contact(**given):
     """Return the deformed state of half-spaces, solved by the projected gradient."""
     family = PROBLEMS["half-space"]
-    case = family.with_keys(**given).build("dual", reference_solution)
+    case = family.build("dual", family.complete(given), reference_solution)
     return case.fields(ProjectedGradient().prepare(case.qp, 1e-8)())
 
 

@@ -1,1 +1,0 @@
-"""Comparison of two result folders: changes, conclusions and their pages."""

@@ -1,1 +1,0 @@
-"""Measurements, read and grouped as reports need them."""

@@ -1,1 +1,0 @@
-"""The report as data: sections, tables and figures, and numbers as text."""

@@ -1,1 +1,0 @@
-"""Renderers of pages as HTML, Markdown and LaTeX, and of figures as files."""

@@ -1,1 +1,0 @@
-"""Statistics: intervals, bootstraps, censored times, and profiles."""
