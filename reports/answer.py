@@ -67,7 +67,7 @@ def with_errors(answers: pd.DataFrame) -> pd.DataFrame:
     """
     verified = answers[answers.verified & answers.objective.notna()]
     best = verified.sort_values("residual").groupby("case").objective.first()
-    least = answers.case.map(best)
+    least = answers.case.map(best).astype(float)
     apart = np.sqrt((answers.objective - least).abs() / least.abs().where(least != 0))
     certified = answers.groupby("case").energy_bound.transform("count") > 0
     return answers.assign(error=answers.energy_bound.where(certified, apart))

@@ -51,6 +51,7 @@ SEVERITY = (
     Verdict.VERIFIED_UNBOUNDED,
     Verdict.VERIFIED,
 )
+_MARK_DIGITS = 6  #: digits of the digest in the mark of a QP
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 #: Columns that identify a cell, on which solvers are compared.
 CELL = ["mode", "case", "tol"]
@@ -198,7 +199,22 @@ def derived(df: pd.DataFrame) -> pd.DataFrame:
         severity=df.status.map({s.value: i for i, s in enumerate(SEVERITY)}),
     )
     known = dofs.groupby(df.problem).transform("first")
-    return df.assign(n=known.fillna(variables.where(~is_dual)))
+    df = df.assign(n=known.fillna(variables.where(~is_dual)))
+    return _divided(df)
+
+
+def _divided(df: pd.DataFrame) -> pd.DataFrame:
+    """Divide cases of equal name whose QPs differ: the later QPs get a mark."""
+    first = df.groupby(["environment", "case"], dropna=False).qp.transform("first")
+    later = df.qp.notna() & (df.qp != first)
+    if not later.any():
+        return df
+    marked = df.problem + "/QP=" + df.qp.str[:_MARK_DIGITS]
+    form = ("/" + df.form).where(df.form != "", "")
+    return df.assign(
+        problem=df.problem.where(~later, marked),
+        case=df.case.where(~later, marked + form),
+    )
 
 
 def _united(

@@ -5,6 +5,7 @@ import os
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 
@@ -172,7 +173,7 @@ def svg_only():
     @contextmanager
     def context():
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("mortarbench.reports.render.saving.ENDINGS", (".svg",))
+            patch.setattr("mortarbench.reports.writing.ENDINGS", (".svg",))
             yield
 
     return context
@@ -196,10 +197,13 @@ def blank():
     def context():
         from matplotlib.figure import Figure  # slow; few processes need it
 
+        from mortarbench.reports.writing import draw_files
+
+        def draw_blank(picture, folder):
+            return draw_files(replace(picture, draw=lambda: Figure((1, 1))), folder)
+
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(
-                "mortarbench.reports.render.saving.draw", lambda _: Figure((1, 1))
-            )
+            patch.setattr("mortarbench.reports.writing.draw_files", draw_blank)
             yield
 
     return context

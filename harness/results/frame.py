@@ -42,7 +42,7 @@ def _type(hint: Any) -> str:
 
 def with_texts(frame: pd.DataFrame) -> pd.DataFrame:
     """Replace tables by JSON text, and verdicts by their values."""
-    objects = frame.select_dtypes(object)
+    objects = frame.loc[:, frame.dtypes == "object"]
     return frame.assign(**objects.apply(_texts))
 
 

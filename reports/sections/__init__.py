@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 
+from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.reports.answer import Row, rows, sentence, table
 from mortarbench.reports.document import Document, Item, Picture, Section, clean
 from mortarbench.reports.figures.curves import answer_figure
@@ -53,9 +54,12 @@ def compose(run: Measurements) -> Document:
                 )
     started = run.df.started[run.df.started != ""]
     when = str(started.min())[:10] if len(started) else "date unknown"
+    recomputed = f"verdicts recomputed: residuals ≤ {run.factor:g} × tol"
+    facts = [when, *dict.fromkeys(machine(run, d) for d in digests)]
+    facts += [recomputed] * (run.factor != VERIFIED_FACTOR)
     return Document(
         title=clean(run.name),
-        dateline=" · ".join([when, *dict.fromkeys(machine(run, d) for d in digests)]),
+        dateline=" · ".join(facts),
         sections=tuple(sections),
         solvers=run.solvers,
     )

@@ -79,11 +79,13 @@ def _bodies(run: Measurements) -> Iterator[Item]:
     stored = stored.sort_values("n", ascending=False, kind="stable")
     drawn = 0
     for (_, _), of in stored.groupby(["environment", "family"], sort=False):
+        case = clean(str(of.case.iloc[0]))
         try:
             fields = load_fields(run.folder, of.fields.iloc[0])
-        except InputError:  # a report needs only the journal
+        except InputError as e:  # a report needs only the journal
+            yield clean(f"{case} is not drawn: {e}", 400)
             continue
-        case, drawn = clean(str(of.case.iloc[0])), drawn + 1
+        drawn += 1
         yield Picture(
             name=f"fields-{drawn}",
             caption=f"{case}: {description(fields)}.",

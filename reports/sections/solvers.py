@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from mortarbench.harness import InputError, Verdict
 from mortarbench.harness.files.store import load_history
 from mortarbench.harness.record import PROVEN, REFUTED
 from mortarbench.harness.solution import History
-from mortarbench.reports.answer import Row, growth_of, series_of
+from mortarbench.reports.answer import Row, growth_of, series_of, with_errors
 from mortarbench.reports.document import (
     ABSENT,
     Item,
@@ -172,6 +173,8 @@ def _time(at: pd.DataFrame, raw: pd.DataFrame) -> str:
     if len(at) > 1:
         return seconds(float(np.exp(np.log(at.total_seconds).mean())))
     samples = raw[raw.case == at.case.iloc[0]].total_seconds.dropna()
+    if samples.empty:
+        return "verified, not timed"
     middle = median_interval(samples)
     if len(samples) < 2:
         return seconds(middle.value)
@@ -287,10 +290,10 @@ def iterations(run: Measurements, rows: list[Row]) -> Iterator[Item]:
                     _drawn, curves.against, solved, run.solvers, "m", "iterations"
                 ),
             )
-    for case, tol, found in _histories(run):
+    for k, (case, tol, found) in enumerate(_histories(run), 1):
         title = f"{case}, tol {tolerance(tol)}"
         yield Picture(
-            name=f"history-{len(title)}-{abs(hash(title)) % 10000}",
+            name=f"history-{k}",
             caption=f"Convergence on {title}. Marks: "
             + ", ".join(f"{m[0]} {m[1]}" for m in curves.STEPS.values())
             + " steps. Each solver uses its own norms; verdicts do not depend on them.",
@@ -309,11 +312,10 @@ def _span(values: Iterable[float]) -> str:
 def _histories(run: Measurements) -> Iterator[tuple[str, float, dict[str, History]]]:
     """Yield the stored histories of the largest case of each form."""
     stored = run.df[run.df.vectors.notna()]
-    stored = stored[[bool(o.get("history")) for o in stored.options]]
-    stored = stored.sort_values(["m", "tol"], ascending=[False, True])
-    for (_, _), of in list(stored.groupby(["family", "form"], sort=False))[
-        :MOST_HISTORIES
-    ]:
+    recorded = np.array([bool(o.get("history")) for o in stored.options], dtype=bool)
+    stored = stored[recorded].sort_values(["m", "tol"], ascending=[False, True])
+    groups = stored.groupby(["family", "form"], sort=False)
+    for _, of in islice(groups, MOST_HISTORIES):
         case, tol = of.case.iloc[0], float(of.tol.iloc[0])
         found: dict[str, History] = {}
         here = of[(of.case == case) & (of.tol == tol)].drop_duplicates("solver")
@@ -328,8 +330,6 @@ def _histories(run: Measurements) -> Iterator[tuple[str, float, dict[str, Histor
 
 def accuracy(run: Measurements, rows: list[Row]) -> Iterator[Item]:
     """Tabulate residuals and certified errors, and plot errors against times."""
-    from mortarbench.reports.answer import with_errors
-
     del rows
     answers = with_errors(run.answers[run.answers.verified])
     answers = answers[answers.residual.notna()]

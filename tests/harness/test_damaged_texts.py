@@ -42,8 +42,9 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import assemble_stiffness
 from mortarbench.problems.families.description import read_bodies
 from mortarbench.registries import Registries
-from mortarbench.reports.data.evidence import read_evidence
-from mortarbench.reports.folder import compose, write_report
+from mortarbench.reports.folder import write_report
+from mortarbench.reports.measurements import read_measurements
+from mortarbench.reports.sections import compose
 from mortarbench.solvers import SOLVERS
 from tests.support import damaged_files, damaged_texts, synthetic_results
 from tests.support.bounded import bounded
@@ -225,7 +226,7 @@ def test_odd_lines_of_a_journal_are_refused_or_reported(tmp_path, count):
     written(journal, "".join(taken.values()))
     (tmp_path / "environment.json").write_text(json.dumps(ENVIRONMENT))
 
-    assert tried("all that were taken", lambda: compose(read_evidence(tmp_path)))
+    assert tried("all that were taken", lambda: compose(read_measurements(tmp_path)))
     assert tried("", lambda: write_report(tmp_path, ("csv", "parquet")))
 
 
@@ -241,9 +242,9 @@ def test_an_odd_environment_is_refused_or_reported(tmp_path, count):
         text = damaged_texts.damaged(text, chance) if chance.random() < 0.3 else text
         written(path, text)
         tried(text, lambda: environment_of(tmp_path, "8c2f9a56e00f"))
-        taken = tried(text, lambda: read_evidence(tmp_path))
+        taken = tried(text, lambda: read_measurements(tmp_path))
         if taken and i % 10 == 0:
-            assert tried(text, lambda: compose(read_evidence(tmp_path)))
+            assert tried(text, lambda: compose(read_measurements(tmp_path)))
 
 
 @COUNTS
@@ -260,9 +261,9 @@ def test_a_damaged_suite_of_a_folder_is_refused_or_reported_and_merged(tmp_path,
             else damaged_texts.damaged(SUITE, chance)
         )
         written(tmp_path / "b" / "suite.toml", text)
-        taken = tried(text, lambda: read_evidence(tmp_path / "b"))
+        taken = tried(text, lambda: read_measurements(tmp_path / "b"))
         if taken and i % 10 == 0:
-            assert tried(text, lambda: compose(read_evidence(tmp_path / "b")))
+            assert tried(text, lambda: compose(read_measurements(tmp_path / "b")))
         if i % 10 == 1:
             shutil.rmtree(tmp_path / "c", ignore_errors=True)
             folders = [tmp_path / "a", tmp_path / "b"]
@@ -351,8 +352,8 @@ ENTRIES = (
     (mb.merge, ["run", "run"], {"out": "merged", "tell": len}),
     (mb.problems, [], {"plugins": (), "registries": None}),
     (mb.report, ["run", None], {
-        "formats": ("csv",), "factor": 10.0, "fail_on": (), "pool_forms": False,
-        "registries": None,
+        "formats": ("csv",), "factor": 10.0, "fail_on": (), "compare": (),
+        "pair": (), "registries": None,
     }),
     (mb.run, ["small.toml"], {
         "out": "measured", "solvers": (), "cases": (), "repeats": 1, "time_limit": 60,

@@ -17,10 +17,10 @@ from mortarbench.harness.files.store import is_stored
 from mortarbench.harness.results.folder import environment_of
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.registries import Registries
-from mortarbench.reports.data.environment import by_environment
-from mortarbench.reports.data.evidence import read_evidence
-from mortarbench.reports.folder import compose
-from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.answer import rows
+from mortarbench.reports.document import markdown
+from mortarbench.reports.measurements import read_measurements
+from mortarbench.reports.sections import compose
 from tests.support import ROOT, TOY_PROBLEM
 
 pytestmark = pytest.mark.together
@@ -128,16 +128,14 @@ def test_an_extended_suite_measures_only_missing_results(campaign):
     assert len(again) == 36  # no measurement is missing
 
 
-def test_solvers_of_different_sessions_are_compared_and_marked_as_unpaired(campaign):
-    evidence = read_evidence(campaign / "grown")
-    said = markdown(compose(evidence))
+def test_solvers_of_different_sessions_are_compared_on_their_common_cases(campaign):
+    run = read_measurements(campaign / "grown")
+    sessions = run.df.groupby("solver").session.nunique()
+    (row,) = (r for r in rows(run) if r.accuracy == 1e-6)
 
-    assert "Measured in different sessions" in said
-    assert "again with exact, lax" in said
-    assert "Unpaired: the two solvers were not measured in the same blocks" in said
-    row = evidence.outcomes["well/dual", 1e-6]
-    assert not row["again"].by_block.keys() & row["exact"].by_block.keys()
-    assert row["lax"].by_block.keys() == row["exact"].by_block.keys()
+    assert sessions.to_dict() == {"exact": 2, "lax": 2, "again": 1}
+    # lax is not accurate enough at any of its tolerances
+    assert {e.solver: e.met for e in row.ranked} == {"exact": 3, "again": 3}
 
 
 @pytest.mark.parametrize(
@@ -208,8 +206,8 @@ def test_equal_measurements_of_two_machines_are_kept_and_reported_apart(
         )
     ]
     records = read_journal(tmp_path / "ab")
-    evidence = read_evidence(tmp_path / "ab")
-    said = markdown(compose(evidence))
+    found = read_measurements(tmp_path / "ab")
+    page = markdown(compose(found))
 
     assert orders[0] == orders[1]
     assert len(records) == len({r.identity for r in records}) == 16
@@ -218,12 +216,11 @@ def test_equal_measurements_of_two_machines_are_kept_and_reported_apart(
     assert [environment_of(tmp_path / "ab", d)["machine"]["cpu"] for d in digests] == [
         "one", "two",
     ]  # fmt: skip
-    place = f"other machine @{digests[1][:6]}"
-    assert set(evidence.solvers) == {"exact", "lax"}
-    for part in by_environment(evidence):
-        assert [len(o.records) for o in part.flat] == [2] * 4
-    assert f"{place} is two (other: machine.cpu)" in said.replace("\\", "")
-    assert "not made yet" not in said
+    assert set(found.solvers) == {"exact", "lax"}
+    for digest in digests:
+        assert [*found.only(environment=digest).answers.repeats] == [2] * 4
+    assert "## Answer (one" in page
+    assert "## Answer (two" in page
     mb.merge(tmp_path / "ba", tmp_path / "a", out=tmp_path / "ab")  # nothing new
     assert read_journal(tmp_path / "ab") == records
 
@@ -233,12 +230,11 @@ def test_two_sessions_on_one_machine_are_kept_and_pooled(measure, campaign, tmp_
     first = measure("a", depths="1")
     shutil.copytree(campaign / "before", tmp_path / "b")
     merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
-    row = read_evidence(tmp_path / "all").outcomes["well/dual", 1e-6]
+    answers = read_measurements(tmp_path / "all").answers
 
     assert merged.records[:4] == first.records
     assert merged.records[4:] == tuple(read_journal(tmp_path / "b"))
-    assert [len(o.records) for o in row.values()] == [4, 4]
-    assert {o.seconds("total").samples for o in row.values()} == {4}
+    assert [*answers[answers.case == "well/dual"].repeats] == [4, 4]
 
 
 def test_a_measurement_of_two_sessions_is_replayed_by_session_and_run_id(
@@ -410,38 +406,49 @@ def test_a_report_fails_on_the_requested_conditions_and_says_so(
         measure(name, solvers=solvers, depths="2, 3, 4")
 
     assert cli("report", "a", "b", "--fail-on", "worse", "--format", "csv")[0] == 0
-    gates = ("--fail-on", "worse,slower", "--format", "csv", "--json")
+    gates = ("--fail-on", "worse,slower=1.5", "--format", "csv", "--json")
     code, out, _ = cli("report", "a", "b", *gates)
     told = json.loads(out)
     assert (code, told["failed_on"]) == (1, ["slower"])
-    (change,) = told["changes"]
-    assert {one["solver"] for one in change["slower"]} == {"new"}
-    assert change["slower"][0]["relative"]["low"] > 1
-    assert (change["cells"], change["worse"]) == (6, [])
+    new, old = told["changes"]
+    assert (new["after"], new["outcome"], new["cells"]) == ("new", "slower", 3)
+    assert new["low"] > 1.5
+    assert (old["after"], old["outcome"], old["worse"]) == ("old", "not_slower", [])
     code, out, _ = cli("report", "a", "b", "c", "--fail-on", "worse", "--format", "md")
     assert code == 1
     assert out.splitlines()[-1] == "failed on worse"
-    assert "c/report/since-a/report.md" in out
-    page = (tmp_path / "c/report/since-a/report.md").read_text()
-    assert "| new |" in page
-    points = [line for line in page.splitlines() if line.startswith("- ")]
-    assert [point[:4] for point in points] == ["- b:", "- c:"]
-    assert all(point.endswith(".") for point in points)  # each entry is a sentence
+    assert "c/report/against-a/report.md" in out
+    assert "worse: old on 3 cells, such as well/depth=2/dual: verified →" in out
     assert cli("report", "a", "c", "--format", "csv")[0] == 0  # without --fail-on
+
+
+def test_two_solvers_of_one_run_are_compared(cli, measure, tmp_path, monkeypatch):
+    monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
+    slow = '{{ name = "slow", label = "{}", options.seconds = {} }}'
+    solvers = f"{slow.format('old', 0.02)}, {slow.format('new', 0.05)}"
+    measure("a", solvers=solvers, depths="2, 3", repeats=3)
+    asked = ("--format", "csv", "--fail-on", "slower=1.2")
+
+    code, out, _ = cli("report", "a", "--compare", "old,new", *asked)
+    assert code == 1
+    assert out.startswith("Changed: new.seconds 0.02 → 0.05.\nslower: new")
+    assert cli("report", "a", "--compare", "new,old", *asked)[0] == 0
+    assert cli("report", "a", "a", "--pair", "old=new", *asked)[0] == 1
 
 
 def test_conditions_that_cannot_be_judged_exit_with_2_and_the_reason(
     cli, stored, measure
 ):
-    assert cli("report", "a", "--fail-on", "worse")[0] == 2
-    code, _, err = cli("report", "a", "b", "--fail-on", "worse")
+    code, _, err = cli("report", "a", "--fail-on", "worse")
     assert code == 2
-    assert "no cell (a solver on a case at a tolerance) is in both a and b" in err
-    code, _, err = cli("report", "a", "a", "--fail-on", "slower")
+    assert "fail-on and pair need two folders, or two solvers" in err
+    code, out, _ = cli("report", "a", "b", "--fail-on", "slower")
     assert code == 2
-    assert "fail-on slower: a and a: no solver has 3 cases" in err
+    assert "cannot tell: exact has no cell that was verified both times" in out
     code, _, err = cli("report", "a", "b", "--fail-on", "slowr")
-    assert (code, "did you mean 'slower'" in err) == (2, True)
+    assert (code, "expected worse, slower, or slower=FACTOR" in err) == (2, True)
+    code, _, err = cli("report", "a", "--compare", "exact,lx", "--format", "csv")
+    assert (code, "did you mean 'lax'" in err) == (2, True)
 
 
 def test_folders_are_merged_from_the_command_line(cli, stored):

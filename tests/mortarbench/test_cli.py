@@ -32,9 +32,9 @@ SOLVERS = load_plugin(TOY_PROBLEM).solvers
 FAMILIES = load_plugin(TOY_PROBLEM).problems
 
 
-def report(folder, formats, *, factor=10.0, pool_forms=False):
+def report(folder, formats, *, factor=10.0):
     name = "index" if factor == 10 else f"index-{factor:g}"
-    return [folder / f"{name}{'-pooled' * pool_forms}.{f}" for f in formats]
+    return [folder / f"{name}.{f}" for f in formats]
 
 
 def paper(registries, out, quick, say):
@@ -239,41 +239,6 @@ def test_report_applies_the_requested_factor(cli, tmp_path):
     assert cli("report", "folder", "--format", "md", "--factor", "2.5") == (
         0, "folder/index-2.5.md\n", "",
     )  # fmt: skip
-
-
-def test_report_pools_forms_of_one_folder_and_refuses_to_for_two(cli, tmp_path):
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-    asked = ("--pool-forms", "--format", "md")
-
-    assert cli("report", "one", *asked) == (0, "one/index-pooled.md\n", "")
-    code, out, err = cli("report", "one", "two", *asked)
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "--pool-forms" in err
-
-
-def compare(first, others, formats, factor):
-    (after,) = others
-    said = [f"{first.name} and {after.name} at {factor:g}", "nothing changed"]
-    return [], said, [after / f"{form}.{form}" for form in formats]
-
-
-def test_two_folders_yield_a_summary_and_a_page_of_changes(cli, monkeypatch, tmp_path):
-    monkeypatch.setattr("mortarbench.reports.write_comparisons", compare)
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-    argv = ["report", "one", "two", "--factor", "3"]
-
-    code, out, _ = cli(*argv, "--format", "csv,html,md")
-
-    assert (code, out.splitlines()) == (
-        0,
-        ["one and two at 3", "nothing changed", "two/html.html"],
-    )
-    _, out, _ = cli(*argv, "--format", "csv,md", "--verbose")
-    assert out.splitlines()[2:] == ["two/csv.csv", "two/md.md"]
-    _, out, _ = cli(*argv, "--format", "csv,md")
-    assert out.splitlines()[2:] == ["two/md.md"]
 
 
 @pytest.mark.parametrize("factor", ["0", "-1", "nan", "inf"])

@@ -97,9 +97,6 @@ SHORTER = {
     "mortarbench report out/make-demo --verbose": (
         "mortarbench report out/demo --format md --verbose"
     ),
-    "mortarbench report out/make-demo --pool-forms": (
-        "mortarbench report out/demo --format csv --pool-forms"
-    ),
     "mortarbench report out/make-demo out/demo": (
         "mortarbench report out/demo out/demo"
     ),

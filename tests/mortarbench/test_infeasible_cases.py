@@ -14,7 +14,7 @@ from mortarbench.harness.conformance.manufactured import (
 )
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.registries import Registries
-from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.measurements import read_measurements
 
 
 def main(argv):
@@ -68,16 +68,13 @@ def test_verified_infeasibility_passes_a_strict_run(qps, tmp_path, capsys):
     count = {r.status for r in found.records}
     assert count == {Verdict.VERIFIED, Verdict.VERIFIED_INFEASIBLE}
     for factor in (10.0, 0.01, 1e4):
-        outcomes = read_evidence(out, factor).flat
-        none = [o for o in outcomes if "none" in o.case]
-        assert all(o.verified for o in none)
-        assert len(none) == 2
+        answers = read_measurements(out, factor).answers
+        assert [*answers[answers.case.str.contains("none")].verified] == [True] * 2
     assert main(["validate", str(out)]) == 0
     capsys.readouterr()
     main(["report", str(out), "--format", "md"])
     page = (out / "report" / "report.md").read_text()
-    assert "✓ verified infeasible" in page
-    assert "Refuted claims" not in page
+    assert "4 answers verified, 0 claims refuted" in page
 
 
 def test_a_folder_of_infeasible_cases_is_validated_and_forged_proofs_detected(

@@ -1,7 +1,5 @@
 """Verdicts for a different acceptance factor follow from the data in the journal."""
 
-import json
-from dataclasses import asdict
 from itertools import pairwise
 
 import numpy as np
@@ -16,8 +14,9 @@ from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.verify.kkt import Residuals, rejudged, verdict
 from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from mortarbench.reports.data.evidence import read_evidence
-from mortarbench.reports.folder import compose, write_report
+from mortarbench.reports.folder import write_report
+from mortarbench.reports.measurements import read_measurements
+from mortarbench.reports.sections import compose
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
@@ -105,11 +104,6 @@ def test_an_answer_without_a_claim_of_success_keeps_the_name_of_its_failure():
     assert rejudged(stored, 1) is Verdict.ITERATION_LIMIT
 
 
-def judge(folder, factor):
-    evidence = read_evidence(folder, factor)
-    return {(o.case, o.solver): o.verdict for o in evidence.flat}, evidence
-
-
 @pytest.fixture
 def folder(tmp_path):
     """Return a result folder with one answer whose largest residual is 4·tol."""
@@ -119,40 +113,19 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_verdict_that_contradicts_its_residuals_is_reported(tmp_path, capsys):
-    changed = record(Status.SOLVED, Residuals(0, 0.5, 0, 0), 1e-6)
-    with Journal(tmp_path, "test") as journal:
-        journal.append(changed.replace(status=Verdict.VERIFIED))
-    read_evidence(tmp_path)
-
-    message = capsys.readouterr().err
-    assert "residuals of verified records exceed 10 times" in message
-    assert changed.run_id in message
-    assert message.count("\n") == 1
-
-
-def test_a_consistent_journal_is_read_without_messages(folder, capsys):
-    read_evidence(folder)
-
-    assert capsys.readouterr().err == ""
-
-
 def test_the_report_applies_and_states_the_factor(folder):
-    page = compose(judge(folder, 1.0)[1])
-    tables = [asdict(t) for s in page.sections for t in s.tables]
-    text = json.dumps(tables, ensure_ascii=False)
+    run = read_measurements(folder, 1.0)
 
-    assert "1 × tolerance" in text
-    assert "dual 4.0e-6 > 1.0e-6" in text
-    assert "recomputed" in " ".join(p for s in page.sections[:2] for p in s.prose)
-    assert "≤ 1 × tol" in " ".join(page.sections[-1].points)
+    assert [*run.answers.status] == ["inaccurate"]
+    assert "verdicts recomputed: residuals ≤ 1 × tol" in compose(run).dateline
 
 
-def test_a_report_at_the_stored_factor_does_not_mention_recomputing(folder):
-    verdicts, evidence = judge(folder, VERIFIED_FACTOR)
+def test_a_report_at_the_stored_factor_does_not_mention_recomputing(folder, capsys):
+    run = read_measurements(folder, VERIFIED_FACTOR)
 
-    assert set(verdicts.values()) == {Verdict.VERIFIED}
-    assert "recomputed" not in " ".join(compose(evidence).sections[0].prose)
+    assert [*run.answers.status] == ["verified"]
+    assert "recomputed" not in compose(run).dateline
+    assert capsys.readouterr().err == ""
 
 
 def test_the_journal_and_its_table_keep_the_status_as_stored(folder):

@@ -150,7 +150,7 @@ forms = ["dual"]
 """
 
 
-def no_report(folder, _formats, *, factor=10.0, pool_forms=False):
+def no_report(folder, _formats, *, factor=10.0):
     return []
 
 

@@ -3,11 +3,10 @@
 import os
 import shutil
 import subprocess
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import mortarbench as mb
 from mortarbench.cli.main import main
@@ -33,16 +32,8 @@ params = {{ path = "{}" }}
 SPARSE = 3 * 2**30  #: size of a sparse file, which occupies no disk space
 
 
-@contextmanager
-def blank_figures():
-    """Write blank figures, since drawing takes far longer than reading all files."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mortarbench.reports.render.saving.draw", lambda _: Figure())
-        yield
-
-
 @pytest.fixture(scope="module")
-def folder_of_run(tmp_path_factory, svg_only):
+def folder_of_run(tmp_path_factory, svg_only, blank):
     """Create a folder with files of every type, whose journal contains only the
     measurements by `smalbe`.
     """
@@ -54,7 +45,7 @@ def folder_of_run(tmp_path_factory, svg_only):
     mine = [r for r in results.records if r.solver == "smalbe"]
     (record,) = (r for r in mine if r.family == "contact-patch")
     keep_environment(folder, record.environment, {"machine": {}})
-    with svg_only(), blank_figures():
+    with svg_only(), blank():
         mb.validate(folder)
         mb.report(folder)
     (journal,) = (folder / "journal").iterdir()
@@ -136,7 +127,7 @@ KINDS = (
 
 @pytest.fixture
 def read_by_every_command(
-    folder_of_run, tmp_path, capsys, monkeypatch, only_svg, request
+    folder_of_run, tmp_path, capsys, monkeypatch, only_svg, blank, request
 ):
     """Run each command that reads a folder, with resource limits; none may raise.
 
@@ -166,7 +157,7 @@ def read_by_every_command(
             assert mb.load(folder).df.shape[0] >= 1
 
     slow = request.node.get_closest_marker("slow")
-    with nullcontext() if slow else blank_figures():
+    with nullcontext() if slow else blank():
         yield read
 
 

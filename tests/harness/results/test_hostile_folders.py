@@ -17,7 +17,7 @@ from mortarbench.harness.results.folder import environment_of
 from mortarbench.harness.results.journal import Journal
 from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from mortarbench.reports import write_report
+from mortarbench.reports.folder import write_report
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.harness.files.test_hostile_files import hostile

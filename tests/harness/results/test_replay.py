@@ -34,7 +34,7 @@ params = { depth = [1, 2] }
 """
 
 
-def no_report(folder, formats, *, factor=10.0, pool_forms=False):
+def no_report(folder, formats, *, factor=10.0):
     return []
 
 

@@ -27,8 +27,8 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
 from mortarbench.harness.suite.suite import Suite
-from mortarbench.reports.data.evidence import read_evidence
-from mortarbench.reports.data.size_series import size_series
+from mortarbench.reports.answer import rows
+from mortarbench.reports.measurements import read_measurements
 from tests.support import ADVERSARIES
 
 PLUGIN = ADVERSARIES
@@ -267,9 +267,7 @@ def test_a_sequence_and_a_cold_solve_of_a_case_are_two_measurements(measure, tmp
 
     assert {r.mode for r in first} == {"cold", "sequence"}
     assert len({r.run_id for r in first}) == 2
-    evidence = read_evidence(tmp_path)
-    assert evidence.solvers == ("honest", "honest (sequence)")
-    assert all(len(o.records) == 1 for o in evidence.flat)
+    assert set(read_measurements(tmp_path).answers["mode"]) == {"cold", "sequence"}
 
 
 def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_path):
@@ -324,10 +322,10 @@ def test_the_exponent_of_a_solver_that_sleeps_by_a_power_law_is_found(
 ):
     sizes = [assemble("sized", FAMILIES["sized"], {"n": n}, "plain") for n in SIZES]
     measure(replace(suite("sleepsbypower", repeats=5), cases=tuple(sizes)))
-    (series,) = size_series(read_evidence(tmp_path))
-    law = series.time_law("sleepsbypower")
+    ((entry,),) = (row.entries for row in rows(read_measurements(tmp_path)))
+    law = entry.growth.exponent
 
-    assert law.points == len(SIZES)
+    assert entry.met == len(SIZES)
     assert law.low <= 1.5 <= law.high
     assert law.high - law.low < 0.1
 
