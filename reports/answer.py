@@ -216,6 +216,19 @@ def series_of(answers: pd.DataFrame) -> pd.Series:
     return labels
 
 
+def decisive(found: Sequence[Row]) -> list[Row]:
+    """Return for each form its most accurate row with enough answers, else the last.
+
+    Enough: the fastest solver solved at least the share `COMPLETE` of the cases.
+    """
+    chosen: dict[str, Row] = {}
+    for row in found:  # from the loosest accuracy on
+        first = next(iter(row.ranked), None)
+        if row.form not in chosen or (first and first.met >= COMPLETE * first.cases):
+            chosen[row.form] = row
+    return [*chosen.values()]
+
+
 def sentence(row: Row) -> str:
     """Return the conclusion of a row: "smalbe fastest; daqp 3.6 × [2.1, 6.2]"."""
     ranked, start = row.ranked, f"{row.form or 'QP'}, {row.label}: "

@@ -6,7 +6,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -36,6 +36,16 @@ class Table:
     caption: str
     data: pd.DataFrame | None = None  #: the numbers; None: the text of the cells
     texts: int = 1  #: number of columns at the left that contain text
+
+    def compact(self) -> Table:
+        """Return the table without columns of numbers whose cells are all empty."""
+        kept = [
+            k
+            for k in range(len(self.head))
+            if k < self.texts or any(row[k] not in ("", ABSENT) for row in self.rows)
+        ]
+        head, *rows = (tuple(row[k] for k in kept) for row in (self.head, *self.rows))
+        return replace(self, head=head, rows=tuple(rows))
 
     def csv(self) -> str:
         """Return the numbers as CSV."""

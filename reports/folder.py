@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from mortarbench.harness.errors import InputError, unknown
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.reports.answer import rows, sentence
+from mortarbench.reports.answer import decisive, rows, sentence
 from mortarbench.reports.export.parquet import write_records
 from mortarbench.reports.figures.curves import against
 from mortarbench.reports.measurements import Measurements, read_measurements
@@ -53,11 +53,11 @@ def write_report(
 
 
 def sentences(run: Measurements) -> list[str]:
-    """Return the sentences of the first screen, one for each form and accuracy."""
+    """Return the sentences of the first screen, one for each form and machine."""
     return [
         sentence(row)
         for digest in dict.fromkeys(run.df.environment)
-        for row in rows(run.only(environment=digest))
+        for row in decisive(list(rows(run.only(environment=digest))))
     ]
 
 

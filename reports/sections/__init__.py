@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.reports.answer import Row, rows, sentence, table
-from mortarbench.reports.document import Document, Item, Picture, Section, clean
+from mortarbench.reports.answer import Row, decisive, rows, sentence, table
+from mortarbench.reports.document import Document, Item, Picture, Section, Table, clean
 from mortarbench.reports.figures.curves import answer_figure
 from mortarbench.reports.measurements import Measurements
 from mortarbench.reports.sections import routes, setting, solvers
@@ -48,7 +48,11 @@ def compose(run: Measurements) -> Document:
         for name, title, build in SECTIONS:
             if k and name in ("definitions", "validation"):
                 continue
-            if items := tuple(build(part, found)):
+            items = tuple(
+                item.compact() if isinstance(item, Table) else item
+                for item in build(part, found)
+            )
+            if items:
                 sections.append(
                     Section(name=name + ending, title=title + where, items=items)
                 )
@@ -66,14 +70,15 @@ def compose(run: Measurements) -> Document:
 
 
 def _answer(run: Measurements, found: list[Row], name: str, title: str) -> Section:
-    items: list[Item] = [table(found, run.solvers), *map(sentence, found)]
-    if any(len(row.ranked) > 1 for row in found):
+    chosen = decisive(found)
+    items: list[Item] = [table(found, run.solvers), *map(sentence, chosen)]
+    if any(len(row.ranked) > 1 for row in chosen):
         items.append(
             Picture(
                 name=name,
                 caption="Time relative to the fastest solver, with the 95 % interval "
                 "of the table.",
-                draw=partial(answer_figure, found, run.solvers),
+                draw=partial(answer_figure, chosen, run.solvers),
             )
         )
     return Section(name=name, title=title, items=tuple(items))

@@ -30,6 +30,7 @@ MULTIGRID = "ipm-amg"  #: solver whose use of the primal form is a route of its 
 DECOMPOSITION = ("feti", "glue", "parts")
 MOST_WAYS = 12  #: largest number of rows in the table of ways
 LEAST_SIZES = 3  #: smallest number of sizes of a map of routes
+LEAST_ROUTES = 3  #: smallest number of routes of a map; `_ways` compares two forms
 
 
 def mesh(run: Measurements, rows: list[Row]) -> Iterator[Item]:
@@ -114,7 +115,7 @@ def _map(answers: pd.DataFrame) -> Iterator[Item]:
     best = fresh.drop_duplicates(["series", "route", "n"])
     kept = best.groupby("series").n.nunique()
     best = best[best.series.isin(kept.index[kept >= LEAST_SIZES])]
-    if best.empty:
+    if best.route.nunique() < LEAST_ROUTES:
         return
     yield Table(
         name="routes",
@@ -124,7 +125,7 @@ def _map(answers: pd.DataFrame) -> Iterator[Item]:
                 clean(str(route), 40), number(top.n, 3), clean(top.solver, 40),
                 seconds(top.mesh_seconds), f"{top.memory:.0f} MiB",
             )
-            for (_, route), of in best.groupby(["series", "route"], sort=False)
+            for route, of in best.groupby("route", sort=False)
             for top in [of.loc[of.n.idxmax()]]
         ),
         caption="Largest size that each route reached, with its fastest solver: time "

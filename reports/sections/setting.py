@@ -15,7 +15,15 @@ from mortarbench.harness.files.store import load_fields
 from mortarbench.harness.record import in_space
 from mortarbench.harness.results.folder import differences
 from mortarbench.reports.answer import Row
-from mortarbench.reports.document import Item, Picture, Table, clean, number, tolerance
+from mortarbench.reports.document import (
+    Item,
+    Picture,
+    Table,
+    clean,
+    number,
+    plural,
+    tolerance,
+)
 from mortarbench.reports.figures.bodies import description, fields_figure
 from mortarbench.reports.figures.tractions import loaded_sides, traction_figure
 from mortarbench.reports.measurements import Measurements
@@ -70,13 +78,16 @@ def _quantity(of: Mapping[str, Any], name: str) -> str:
     if not all(isinstance(v, int | float) for v in parts):
         return ""
     size = max((abs(v) for v in parts), default=0.0)
+    if isinstance(value, int):  # a number of rows
+        return str(value)
     shown = ", ".join("0" if abs(v) < 1e-6 * size else number(v, 4) for v in parts)
     return f"{f'({shown})' if len(parts) > 1 else shown} {unit}".strip()
 
 
 def _bodies(run: Measurements) -> Iterator[Item]:
     stored = run.answers[run.answers.verified & run.answers.fields.notna()]
-    stored = stored.sort_values("n", ascending=False, kind="stable")
+    # the last case in the order of the suite, such as the last load step
+    stored = stored[::-1].sort_values("n", ascending=False, kind="stable")
     drawn = 0
     for (_, _), of in stored.groupby(["environment", "family"], sort=False):
         case = clean(str(of.case.iloc[0]))
@@ -132,15 +143,16 @@ def settings(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         texts=2,
     )
     tolerances = sorted(set(df.tol), reverse=True)
-    lines = {
+    sessions = plural(df.session.nunique(), "session")
+    repeats = df.groupby(["case", "solver", "tol"]).size().max()
+    lines: dict[str, Any] = {
         "tolerances": ", ".join(map(tolerance, tolerances)),
         "verified if every residual ≤": f"{run.factor:g} · tolerance",
-        "repeats": number(float(df.groupby(["case", "solver", "tol"]).size().max())),
-        "time limit in s": run.suite and run.suite.time_limit,
-        "memory limit in MiB": run.suite and run.suite.memory_limit,
-        "measured (UTC)": f"{df.started.min()} to {df.started.max()}",
-        "sessions": df.session.nunique(),
+        "repeats": f"{repeats} in {sessions}, {df.started.min()} to {df.started.max()}",
     }
+    if run.suite:
+        time, memory = run.suite.time_limit, run.suite.memory_limit
+        lines["limits"] = f"{time:g} s, {memory:g} MiB"
     environments = [e for e in run.environments.values() if e]
     if environments:
         lines |= {k: _in_a_line(v) for k, v in environments[0].items()}
@@ -150,9 +162,9 @@ def settings(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         rows=tuple(
             (clean(str(k), 60), clean(str(v), 800))
             for k, v in lines.items()
-            if v is not None
+            if v and k != "digest"
         ),
-        caption="Settings and environment.",
+        caption="Settings and environment; times of the start in UTC.",
         texts=2,
     )
     for other in environments[1:]:
