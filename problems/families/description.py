@@ -59,9 +59,9 @@ axes may have any length. The centre of a cylinder is any point on its axis. Con
 with a rigid body has nodal rows even if ``contact = "mortar"``.
 
 The default of reach is the larger extent of the two sides, or no limit for a rigid
-body. Slave nodes beyond the border of the master by more than half a facet have no
-contact row, nor do nodes whose row has no free component because of supports. Each pair
-needs a node with a row.
+body. Slave nodes more than nine tenths of a facet beyond the border of the master have
+no contact row, nor do nodes whose row has no free component because of supports. Each
+pair needs a node with a row.
 
 In .inp files, bodies are element sets, boundaries are surfaces, element sets of facets
 or node sets, and points are node sets. In .med files, bodies are groups of cells,

@@ -1,11 +1,12 @@
-"""Commands in the documents work, in the order of their page.
+"""Commands and sessions in the documents work, in the order of their page.
 
-The commands of a page are in blocks ```sh; those of the README are indented lines. The
-files that these commands need are the blocks after ``<!-- file: NAME -->``. Commands
-that take too long are run in a shorter form, and those that cannot be run here are
-listed with the reason.
+The commands of a page are in blocks ```sh; those of the README are indented lines.
+Python sessions are in blocks ```pycon, and print the output shown. The files that they
+need are the blocks after ``<!-- file: NAME -->``. Commands that take too long are run
+in a shorter form, and those that cannot be run here are listed with the reason.
 """
 
+import doctest
 import json
 import re
 import shlex
@@ -118,22 +119,14 @@ ELSEWHERE = {
     "python cluster.py": "it submits jobs to a batch system",
     "python benchmarks/ranks.py": "a measurement of minutes, in a checkout",
     "mortarbench run fleet --out out/fleet --dask tcp://login1:PORT": "the same",
-    "mortarbench solve bodies:press.toml/parts=20/glue=redundant/dual "
-    "--solver smalbe": "test_subdomains.py; the file is that of own-geometry.md",
     "gmsh -2 -order 1 press.geo": "gmsh is not installed; its output is in tests/data",
-    "gmsh -2 -order 1 fit.geo": "the same",
-    "gmsh -2 -order 1 pipe.geo": "the same",
-    "gmsh -2 -order 1 bracket.geo": "the same",
-    "gmsh -3 -order 1 blocks.geo": "gmsh is not installed; its output is in tests/data",
     ".venv/bin/python -m pip install -c constraints.txt -e '.[cluster]'": (
         "the environment exists"
     ),
 }
 #: files that programs outside of the test environment would write, by page
 SUPPLIED = {
-    "own-geometry": ("press.msh",),
-    "solids": ("blocks.msh",),
-    "loads": ("fit.msh", "pipe.msh", "bracket.msh"),
+    "own-bodies": ("press.msh", "blocks.msh", "blocks.toml"),
 }
 #: files that the commands of a page must write, with a pattern of their contents
 PROMISED = {
@@ -143,15 +136,10 @@ PROMISED = {
         "out/mine/report/records.parquet": "",
         "out/again/report/against-mine/index.html": r"changes from mine to again",
     },
-    "own-geometry": {
+    "own-bodies": {
         "press.png": "",
         "press.vtu": r'Name="pressure"',
         "press-disc-on-upper.csv": "pressure_Pa",
-    },
-    "loads": {"fit.png": "", "pipe.png": "", "bracket.png": ""},
-    "solids": {
-        "blocks.png": "",
-        "blocks.vtu": r'Name="pressure"',
         "blocks-upper-on-lower.csv": "pressure_Pa",
     },
     "howto": {
@@ -173,8 +161,8 @@ _LAST = re.compile(r"\s+#\s+exit code (\d)$")
 
 
 def parts(text):
-    """Yield the instructions of a page: ("file", name, content) or ("run", command,
-    code).
+    """Yield the instructions of a page: ("file", name, content), ("run", command,
+    code) or ("session", text, 0).
     """
     fence, name, lines = None, None, []
     for line in text.splitlines():
@@ -185,6 +173,8 @@ def parts(text):
         elif line.startswith("```"):
             if name is not None:
                 yield "file", name, "\n".join(lines) + "\n"
+            elif fence == "pycon":
+                yield "session", "\n".join(lines) + "\n", 0
             elif fence == "sh":
                 yield from (("run", *command(each)) for each in lines if each)
             fence = name = None
@@ -251,16 +241,24 @@ def execute(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_command_of_a_page_works(page, execute, tmp_path):
-    """Commands run in the order of the page and may read files that earlier commands
-    wrote.
-    """
+def test_every_command_and_session_of_a_page_works(page, execute, tmp_path, capsys):
+    """They run in the order of the page and may read files that earlier ones wrote."""
     instead, elsewhere = normal(SHORTER), normal(ELSEWHERE)
+    parser, runner = (
+        doctest.DocTestParser(),
+        doctest.DocTestRunner(optionflags=doctest.ELLIPSIS),
+    )
+    names = {}
     for name in SUPPLIED.get(page.stem, ()):
         shutil.copy(ROOT / "tests" / "data" / name, tmp_path)
     for kind, what, more in shown(page):
         if kind == "file":
             (tmp_path / what).write_text(more, "utf-8")
+        elif kind == "session":
+            session = parser.get_doctest(what, names, page.stem, None, 0)
+            failed = runner.run(session, clear_globs=False).failed
+            assert failed == 0, capsys.readouterr().out
+            names = session.globs
         elif what not in elsewhere:
             assert execute(instead.get(what, what)) == more, what
     for file, pattern in PROMISED.get(page.stem, {}).items():

@@ -1,14 +1,16 @@
 """Hooks of mkdocs for pages from sources other than docs/*.md, and for formulas.
 
 README, CONTRIBUTING and CHANGELOG become pages of the site. Notebooks in docs/gallery
-are executed and converted to pages. The help text of each command is inserted into
-`commands.md`. Formulas, which the sources contain as LaTeX between dollar signs, are
-converted to MathML.
+are executed and converted to pages. Annotations and docstrings yield the pages on
+families and records. The help text of each command is inserted into `commands.md`.
+Formulas, which the sources contain as LaTeX between dollar signs, are converted to
+MathML.
 """
 
 from __future__ import annotations
 
 import html
+import inspect
 import os
 import re
 import subprocess
@@ -20,6 +22,8 @@ from typing import TYPE_CHECKING
 from mortarbench.reports.render.formulas import mathml
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
@@ -50,6 +54,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, page in PAGES.items():
         text = from_root((ROOT / name).read_text("utf-8"))
         files.append(File.generated(config, page, content=text))
+    files.append(File.generated(config, "families.md", content=family_page()))
     files.append(File.generated(config, "records.md", content=record_page()))
     if WEAKNESSES.is_file():
         content = WEAKNESSES.read_text("utf-8")
@@ -121,6 +126,54 @@ def from_root(text: str) -> str:
     return text
 
 
+def table(*rows: Iterable[str]) -> str:
+    """Return a Markdown table; the first row contains the heads of the columns."""
+    lines = [
+        f"| {' | '.join(c.replace('|', chr(92) + '|') for c in r)} |" for r in rows
+    ]
+    return "\n".join([lines[0], re.sub(r"[^|]+", " --- ", lines[0]), *lines[1:]])
+
+
+def family_page() -> str:
+    """Return a page with the problem and the keys of every family.
+
+    The problem is described by the docstrings of the class and, for the first family of
+    a module, of the module; the keys follow from annotations.
+    """
+    from mortarbench.harness.keys import keys_of
+    from mortarbench.problems import PROBLEMS
+    from mortarbench.problems.families import description
+
+    heads, parts, described = ("key", "default", "values", "meaning"), [], set()
+    for name, family in PROBLEMS.items():
+        kind = type(family)
+        docs = [inspect.getdoc(kind)]
+        if kind.__module__ not in described:
+            docs.append(inspect.getdoc(sys.modules[kind.__module__]))
+        described.add(kind.__module__)
+        if name == "bodies":
+            docs.append(inspect.getdoc(description))
+        keys = []
+        for key in keys_of(kind).values():
+            values, _, meaning = str(key).partition(": ")
+            default = "" if key.default is None else f"`{key.default}`"
+            keys.append((f"`{key.name}`", default, values, meaning))
+        text = re.sub(r"^::\n", "", "\n\n".join(filter(None, docs)), flags=re.M)
+        text = text.replace("::\n", ":\n")
+        # escape the asterisk of λ* outside of indented code
+        text = re.sub(r"^(?! {4})(.*\w)\*", r"\1\\*", text, flags=re.M)
+        forms = ", ".join(f"`{form}`" for form in family.forms)
+        parts += [f"## {name}", text, f"Forms: {forms}.", table(heads, *keys)]
+    return "\n\n".join(
+        [
+            "# Families of problems",
+            "**Which keys may a [case name](cases.md) contain?** An empty default "
+            "follows from other keys or from the file of the case.",
+            *parts,
+        ]
+    )
+
+
 def record_page() -> str:
     """Return a page with a table of the fields of a record, from their annotations."""
     import msgspec
@@ -139,15 +192,14 @@ def record_page() -> str:
             for limit, sign in signs.items()
             if limit in kind and kind[limit] < 2**62
         ]
-        cells = " or ".join(words), ", ".join(limits), field["description"]
-        rows.append(f"| `{name}` | {' | '.join(cells)} |\n")
+        text = field["description"]
+        rows.append((f"`{name}`", " or ".join(words), ", ".join(limits), text))
     return (
         "# Fields of a record\n\n"
         "A line of the journal is a JSON object with these fields. `results.df`, the "
         "CSV table `measurements` and `records.parquet` have a column for each field. "
         "A value that was not measured is null.\n\n"
-        "| field | type | range | content |\n| --- | --- | --- | --- |\n"
-        + "".join(rows)
+        + table(("field", "type", "range", "content"), *rows)
     )
 
 

@@ -21,7 +21,7 @@ The antiderivatives are Y ln(X + r) for I_xx, X ln(Y + r) for I_yy and −r for 
 An entry depends only on the relative position of two cells. Therefore F is a principal
 submatrix of the circulant matrix C of a periodic grid of about twice the size:
 Fx = RᵀCRx, where R extends x by zeros. The FFT diagonalises C. Hence
-λ_min(F) ≥ λ_min(C); see docs/mathematics.md.
+λ_min(F) ≥ λ_min(C); see docs/certificates.md.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 from tests.support import ROOT
 
 EXACT = SMALBE(eliminate="never")
-#: blocks of docs/solids.md with friction; supports prevent the upper one from sliding
+#: blocks of docs/own-bodies.md; supports prevent the upper one from sliding
 BLOCKS = """
 mesh = "blocks.msh"
 length_unit = "mm"

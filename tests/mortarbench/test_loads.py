@@ -1,6 +1,5 @@
-"""The examples of docs/loads.md, from their gmsh meshes to the stated forces."""
+"""Loads, supports and materials of user-defined bodies, from their gmsh meshes."""
 
-import re
 import shutil
 
 import numpy as np
@@ -9,19 +8,14 @@ import pytest
 import mortarbench as mb
 from tests.support import ROOT
 
-PAGE = (ROOT / "docs" / "loads.md").read_text("utf-8")
-
 
 @pytest.fixture
 def solve(tmp_path):
-    """Return a function that solves an example of the page with Clarabel."""
+    """Return a function that solves an example of `tests/data` with Clarabel."""
 
     def answer(name):
-        shutil.copy(ROOT / "tests" / "data" / f"{name}.msh", tmp_path)
-        (toml,) = re.findall(
-            rf"<!-- file: {name}.toml -->\n```toml\n(.*?)```", PAGE, re.S
-        )
-        (tmp_path / f"{name}.toml").write_text(toml)
+        for suffix in (".msh", ".toml"):
+            shutil.copy(ROOT / "tests" / "data" / f"{name}{suffix}", tmp_path)
         found = mb.solve(f"bodies:{tmp_path}/{name}.toml/dual", "clarabel")
         assert found.verdict == "verified"
         return found
@@ -34,9 +28,7 @@ def test_the_press_fit_has_lame_s_pressure(solve):
     p = 210e9 * d / b * (b**2 - a**2) * (c**2 - b**2) / (2 * b**2 * (c**2 - a**2))
     force = solve("fit").quantities["contacts"]["shaft on hub"]["force"]["hub"]
 
-    assert f"{p / 1e6:.2f}" in PAGE
     assert force == pytest.approx([p * b, p * b], rel=6e-3)
-    assert f"({force[0]:.0f}, {force[1]:.0f}) N/m" in PAGE
 
 
 def test_the_ground_carries_the_weight_of_the_pipe(solve):
@@ -44,9 +36,7 @@ def test_the_ground_carries_the_weight_of_the_pipe(solve):
     weight = np.pi / 2 * (0.1**2 - 0.09**2) * 7850 * 9.81
     (pair,) = found.quantities["contacts"].values()
 
-    assert f"{weight:.2f} N/m for round sides" in PAGE
     assert -pair["force"]["ground"][1] == pytest.approx(weight, rel=5e-3)
-    assert f"{-pair['force']['ground'][1]:.2f} N/m" in PAGE
     # the springs carry both weights; the hoop stress is that of a thick cylinder
     fields = found.fields()
     x, u = fields.points, fields.displacement
@@ -68,7 +58,7 @@ def test_the_bracket_presses_its_pad_onto_the_floor(solve):
     sole = (points[:, 0] > 0.05) & (points[:, 1] < 0.0401)
 
     assert list(found.quantities["max_von_mises"]) == ["steel", "rubber"]
-    assert f"{pair['force']['rubber'][1]:.0f} N/m" in PAGE
+    assert 0 < pair["force"]["rubber"][1] < 0.02 * 80e3  # the pad is soft
     assert u[sole, 1] == pytest.approx(-1e-4, abs=1e-9)
     # tip of a cantilever of length 70 mm and thickness 10 mm under 1 MPa
     tip = 1e6 * 0.07**4 / (8 * 210e9 / (1 - 0.3**2) * 0.01**3 / 12)
