@@ -14,7 +14,13 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from mortarbench.reports.document import Table, accuracy_text, plural, short
+from mortarbench.reports.document import (
+    Table,
+    accuracy_text,
+    plural,
+    short,
+    short_name,
+)
 from mortarbench.reports.intervals import Pooled, PowerLaw, pooled, power_law
 from mortarbench.reports.measurements import KEY, Measurements, in_order
 
@@ -231,28 +237,29 @@ def decisive(found: Sequence[Row]) -> list[Row]:
 
 def sentence(row: Row) -> str:
     """Return the conclusion of a row: "smalbe fastest; daqp 3.6 × [2.1, 6.2]"."""
-    ranked, start = row.ranked, f"{row.form or 'QP'}, {row.label}: "
+    ranked, start = row.ranked, f"{short_name(row.form) or 'QP'}, {row.label}: "
     if not ranked:
         return f"{start}no solver reached this accuracy on any case"
     first, others = ranked[0], ranked[1:]
+    name = short_name(first.solver)
     partly = f" (on {first.met} of {first.cases} cases)" * (first.met < first.cases)
     if not others:
-        return f"{start}only {first.solver} reached it{partly}"
+        return f"{start}only {name} reached it{partly}"
     slower = [e for e in others if e.time and e.time.ratio.low > 1]
     tied = [e for e in others if e not in slower and e.met >= first.met]
-    following = f"{slower[0].solver} {short(slower[0].time)}" if slower else ""
+    following = (
+        f"{short_name(slower[0].solver)} {short(slower[0].time)}" if slower else ""
+    )
     if not tied:
         return (
-            f"{start}{first.solver} fastest{partly}; {following}"
+            f"{start}{name} fastest{partly}; {following}"
             if slower
-            else (
-                f"{start}{first.solver} fastest{partly}; the others solved fewer cases"
-            )
+            else (f"{start}{name} fastest{partly}; the others solved fewer cases")
         )
-    names = ", ".join(f"{e.solver} {short(e.time)}" for e in tied[:2])
+    names = ", ".join(f"{short_name(e.solver)} {short(e.time)}" for e in tied[:2])
     more = f" and {len(tied) - 2} more" * (len(tied) > 2)
     return (
-        f"{start}cannot tell {first.solver} from {names}{more} {advice(tied[0].time)}"
+        f"{start}cannot tell {name} from {names}{more} {advice(tied[0].time)}"
         + f"; then {following}" * bool(slower)
     )
 
@@ -278,7 +285,7 @@ def table(found: Sequence[Row], solvers: Sequence[str]) -> Table:
     for row in found:
         by_solver = {e.solver: e for e in row.entries}
         cells = [_cell(by_solver.get(s)) for s in shown]
-        lines.append((row.form or "QP", row.label, *cells))
+        lines.append((short_name(row.form) or "QP", row.label, *cells))
         for e in row.entries:
             ratio = e.time.ratio if e.time else (None,) * 3
             law = e.growth.exponent if e.growth else (None,) * 3
@@ -287,7 +294,7 @@ def table(found: Sequence[Row], solvers: Sequence[str]) -> Table:
             )
     return Table(
         name="answer",
-        head=("form", "accuracy", *shown),
+        head=("form", "accuracy", *map(short_name, shown)),
         rows=tuple(lines),
         caption="Time relative to the fastest solver of the row: geometric mean over "
         "the cases with its 95 % interval (Student's, over cases; over repeats of a "

@@ -19,6 +19,7 @@ from mortarbench.reports.document import (
     interval,
     number,
     plural,
+    short_name,
     tolerance,
 )
 from mortarbench.reports.measurements import Measurements
@@ -120,7 +121,7 @@ def _table(changes: Sequence[Change]) -> Table:
 
 def _statuses(changes: Sequence[Change]) -> Iterator[Table]:
     rows = [
-        (clean(c.name, 40), clean(r.case), tolerance(r.tol), f"{r.old} → {r.new}")
+        (short_name(c.name), clean(r.case), tolerance(r.tol), f"{r.old} → {r.new}")
         for c in changes
         for r in c.statuses.sort_values("turn").itertuples()
     ]
@@ -136,16 +137,16 @@ def _statuses(changes: Sequence[Change]) -> Iterator[Table]:
 
 def _cells(changes: Sequence[Change]) -> Iterator[Table]:
     rows = [
-        (r.ratio, (clean(c.name, 40), clean(r.case), tolerance(r.tol), number(r.ratio)))
+        (r.ratio, short_name(c.name), clean(r.case), tolerance(r.tol))
         for c in changes
         for r in c.by_cell.itertuples()
     ]
-    rows.sort(key=lambda each: -each[0])
+    rows.sort(key=lambda row: -row[0])
     if rows:
         yield Table(
             name="cells",
             head=("solver", "case", "tol", "time after / before"),
-            rows=tuple(row for _, row in rows[:MOST_CELLS]),
+            rows=tuple((*row, number(ratio)) for ratio, *row in rows[:MOST_CELLS]),
             caption="Cells with the largest ratios.",
             texts=2,
         )

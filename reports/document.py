@@ -95,7 +95,8 @@ class Document:
     sections: tuple[Section, ...]
     solvers: tuple[str, ...] = field(default=())  #: solvers that a page can hide
     footer: str = (
-        "Tables: tables/*.csv and tables/*.tex; all measurements: records.parquet."
+        "Tables: tables/*.csv and tables/*.tex; all measurements: records.parquet and "
+        "tables/measurements.csv."
     )
 
 
@@ -121,6 +122,16 @@ def clean(text: str, limit: int = 96) -> str:
         tail = limit // 3
         line = f"{line[: limit - tail - 1]}…{line[-tail:]}"
     return f"◌{line[: limit - 1]}" if line and unicodedata.combining(line[0]) else line
+
+
+def short_name(text: str) -> str:
+    """Sanitise the name of a solver or a form, with at most 40 characters."""
+    return clean(text, 40)
+
+
+def stem(text: str) -> str:
+    """Return the stem of a file name: letters, digits and hyphens of a text."""
+    return re.sub(r"\W+", "-", clean(text, 40), flags=re.ASCII).strip("-")
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -186,6 +197,7 @@ def plural(count: int, noun: str) -> str:
 # Markdown
 
 _MARKUP = re.compile(r"([\\`*_\[\]|~])")
+_LINKS = re.compile(r"(?<=\w)(?=://|@\w)|(?<=www)(?=\.)")  # become links unasked
 
 
 def markdown(document: Document) -> str:
@@ -207,8 +219,8 @@ def markdown(document: Document) -> str:
 
 def _md(text: str) -> str:
     safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    safe = _MARKUP.sub(r"\\\1", safe)
-    return re.sub(r"^(\s*)([-+#]|\d+[.)])(?=\s)", r"\1\\\2", safe)
+    safe = _LINKS.sub(r"\\", _MARKUP.sub(r"\\\1", safe))
+    return re.sub(r"^(\s*\d*)([-+#.)])(?=\s)", r"\1\\\2", safe)
 
 
 def _md_table(table: Table) -> str:

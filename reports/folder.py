@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from mortarbench.harness.errors import InputError, unknown
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.reports.answer import decisive, rows, sentence
-from mortarbench.reports.export.parquet import write_records
+from mortarbench.reports.export.records import write_csv, write_parquet
 from mortarbench.reports.figures.curves import against
 from mortarbench.reports.measurements import Measurements, read_measurements
 from mortarbench.reports.sections import compose
@@ -46,9 +46,11 @@ def write_report(
     written = []
     if {"html", "md", "tex", "csv"} & set(formats):
         written += write_document(compose(run), target, formats)
+    stored = run if factor == VERIFIED_FACTOR else read_measurements(directory)
+    if "csv" in formats:
+        written.append(write_csv(target / "tables" / "measurements.csv", stored.df))
     if "parquet" in formats:
-        stored = run if factor == VERIFIED_FACTOR else read_measurements(directory)
-        written.append(write_records(target / "records.parquet", stored.df))
+        written.append(write_parquet(target / "records.parquet", stored.df))
     return written
 
 

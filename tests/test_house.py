@@ -54,8 +54,8 @@ def users(name):
 @pytest.mark.parametrize(
     ("name", "homes"),
     [
-        # html_page.py computes the script hash of the content security policy
-        ("hashlib", ["harness/digest.py", "reports/render/html_page.py"]),
+        # page.py computes the script hash of the content security policy
+        ("hashlib", ["harness/digest.py", "reports/page.py"]),
         ("os.replace", ["harness/files/durable.py"]),
         ("os.rename", []),
         ("os.link", []),

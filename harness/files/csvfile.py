@@ -31,12 +31,13 @@ def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return a table as CSV, with floats in full precision and empty cells for None."""
     text = StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(map(_cell, heads))
-    writer.writerows(map(_cell, row) for row in rows)
+    writer.writerow(map(safe, heads))
+    writer.writerows(map(safe, row) for row in rows)
     return text.getvalue()
 
 
-def _cell(value: object) -> object:
+def safe(value: object) -> object:
+    """Return a text without formulas and control characters; other values unchanged."""
     return visible(inert(value)) if isinstance(value, str) else value
 
 

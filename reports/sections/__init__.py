@@ -7,10 +7,18 @@ from functools import partial
 
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.reports.answer import Row, decisive, rows, sentence, table
-from mortarbench.reports.document import Document, Item, Picture, Section, Table, clean
+from mortarbench.reports.document import (
+    Document,
+    Item,
+    Picture,
+    Section,
+    Table,
+    clean,
+    short_name,
+)
 from mortarbench.reports.figures.curves import answer_figure
 from mortarbench.reports.measurements import Measurements
-from mortarbench.reports.sections import routes, setting, solvers
+from mortarbench.reports.sections import context, routes, solvers
 
 Build = Callable[[Measurements, list[Row]], Iterator[Item]]
 
@@ -24,10 +32,10 @@ SECTIONS: tuple[tuple[str, str, Build], ...] = (
     ("accuracy", "Accuracy", solvers.accuracy),
     ("sequences", "Sequences", routes.sequences),
     ("ranks", "Ranks", routes.ranks),
-    ("physics", "Fields and physics", setting.physics),
-    ("validation", "Cross-validation", setting.crossval),
-    ("settings", "Settings and environment", setting.settings),
-    ("definitions", "Definitions", setting.definitions),
+    ("physics", "Fields and physics", context.physics),
+    ("validation", "Cross-validation", context.crossval),
+    ("settings", "Settings and environment", context.settings),
+    ("definitions", "Definitions", context.definitions),
 )
 
 
@@ -57,7 +65,7 @@ def compose(run: Measurements) -> Document:
                     Section(name=name + ending, title=title + where, items=items)
                 )
     started = run.df.started[run.df.started != ""]
-    when = str(started.min())[:10] if len(started) else "date unknown"
+    when = clean(str(started.min())[:10]) if len(started) else "date unknown"
     recomputed = f"verdicts recomputed: residuals ≤ {run.factor:g} × tol"
     facts = [when, *dict.fromkeys(machine(run, d) for d in digests)]
     facts += [recomputed] * (run.factor != VERIFIED_FACTOR)
@@ -65,7 +73,7 @@ def compose(run: Measurements) -> Document:
         title=clean(run.name),
         dateline=" · ".join(facts),
         sections=tuple(sections),
-        solvers=run.solvers,
+        solvers=tuple(map(short_name, run.solvers)),
     )
 
 

@@ -18,6 +18,7 @@ from mortarbench.reports.document import (
     plural,
     seconds,
     short,
+    short_name,
     tolerance,
 )
 from mortarbench.reports.figures import curves
@@ -122,7 +123,7 @@ def _map(answers: pd.DataFrame) -> Iterator[Item]:
         head=("route", "largest n", "solver", "time", "memory"),
         rows=tuple(
             (
-                clean(str(route), 40), number(top.n, 3), clean(top.solver, 40),
+                short_name(str(route)), number(top.n, 3), short_name(top.solver),
                 seconds(top.mesh_seconds), f"{top.memory:.0f} MiB",
             )
             for route, of in best.groupby("route", sort=False)
@@ -155,9 +156,12 @@ def _pays(best: pd.DataFrame) -> Iterator[str]:
             slower = both.index[~faster]
             beyond = both.index[both.index > (slower.max() if len(slower) else 0)]
             if len(beyond):
-                lines.append(f"{route} from n = {number(float(beyond[0]))} on")
+                lines.append(
+                    f"{clean(str(route), 60)} from n = {number(float(beyond[0]))} on"
+                )
         if primal and lines:
-            yield f"{series}: faster than the primal routes: {'; '.join(lines)}."
+            text = f"faster than the primal routes: {'; '.join(lines)}"
+            yield f"{clean(str(series))}: {text}."
 
 
 def sequences(run: Measurements, rows: list[Row]) -> Iterator[Item]:
@@ -175,7 +179,7 @@ def sequences(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         lines.append(
             (
                 clean(str(form), 24),
-                clean(str(solver), 40),
+                short_name(str(solver)),
                 str(of.case.nunique()),
                 seconds(float(of.total_seconds.sum())),
                 seconds(float(both.total_seconds_cold.sum())) if len(both) else "",
@@ -214,7 +218,7 @@ def ranks(run: Measurements, rows: list[Row]) -> Iterator[Item]:
             lines.append(
                 (
                     clean(str(case)),
-                    clean(str(base), 40),
+                    short_name(str(base)),
                     tolerance(float(tol)),
                     str(n),
                     seconds(float(one.solve_seconds.median())),

@@ -26,6 +26,8 @@ from mortarbench.reports.document import (
     number,
     plural,
     seconds,
+    short_name,
+    stem,
     tolerance,
 )
 from mortarbench.reports.figures import curves
@@ -65,7 +67,7 @@ def outcomes(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         name="outcomes",
         head=("solver", *GROUPS),
         rows=tuple(
-            (clean(s, 40), *(str(c or "") for c in counts[s])) for s in run.solvers
+            (short_name(s), *(str(c or "") for c in counts[s])) for s in run.solvers
         ),
         caption="Measurements by status.",
     )
@@ -81,9 +83,10 @@ def outcomes(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         head=("solver", "form", "status", "message", "to repeat", "measurements"),
         rows=tuple(
             (
-                clean(solver, 40), clean(form, 24), status.replace("_", " "),
+                short_name(solver), clean(form, 24), status.replace("_", " "),
                 clean(of.message.mode().iloc[0], 90),
-                f"{of.session.iloc[0]}-{of.run_id.iloc[0]}".strip("-"), str(len(of)),
+                clean(f"{of.session.iloc[0]}-{of.run_id.iloc[0]}".strip("-"), 60),
+                str(len(of)),
             )
             for (solver, form, status), of in groups[:MOST_FAILURES]
         ),
@@ -136,19 +139,19 @@ def _times_of(run: Measurements, form: str, of: pd.DataFrame) -> Table:
         error = solved.energy_bound.max()
         lines.append(
             (
-                clean(solver, 40),
+                short_name(solver),
                 *cells,
                 number(count) if np.isfinite(count) else ABSENT,
                 number(error, 2),
                 law(growth_of(solved)).replace(" ", "\n", 1),
             )
         )
-    tol = tolerance(float(of.tol.min()))
+    tol, named = tolerance(float(of.tol.min())), short_name(form) or "QP"
     return Table(
-        name=f"times-{form or 'qp'}",
+        name=f"times-{stem(form) or 'qp'}",
         head=("solver", *(f"m = {m:.0f}" for m in sizes), "iterations", "error", "p"),
         rows=tuple(lines),
-        caption=f"Form {form or 'QP'}, tolerance {tol}: median time of preparation and "
+        caption=f"Form {named}, tolerance {tol}: median time of preparation and "
         "solve by the size m of the dual, with the 95 % interval of the median below "
         "(range of fewer than six repeats; geometric mean if several cases have this "
         "size). Iterations: median; error: largest certified error, relative, in the "
@@ -194,8 +197,16 @@ def scaling(run: Measurements, rows: list[Row]) -> Iterator[Item]:
             mine = of[of.solver == solver]
             by_m, by_n = growth_of(mine, "m"), growth_of(mine, "n")
             if by_m or by_n:
-                sizes = f"{number(mine.m.min())} to {number(mine.m.max())}"
-                fits.append((str(form), clean(solver, 40), sizes, law(by_n), law(by_m)))
+                sizes = _span(mine.m)
+                fits.append(
+                    (
+                        short_name(str(form)),
+                        short_name(solver),
+                        sizes,
+                        law(by_n),
+                        law(by_m),
+                    )
+                )
     if fits:
         yield Table(
             name="exponents",
@@ -266,8 +277,8 @@ def iterations(run: Measurements, rows: list[Row]) -> Iterator[Item]:
             )
             lines.append(
                 (
-                    str(form),
-                    clean(solver, 40),
+                    short_name(str(form)),
+                    short_name(solver),
                     _span(mine.iterations),
                     _span(mine.products),
                     law(fit),
@@ -294,7 +305,7 @@ def iterations(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         title = f"{case}, tol {tolerance(tol)}"
         yield Picture(
             name=f"history-{k}",
-            caption=f"Convergence on {title}. Marks: "
+            caption=f"Convergence on {clean(title)}. Marks: "
             + ", ".join(f"{m[0]} {m[1]}" for m in curves.STEPS.values())
             + " steps. Each solver uses its own norms; verdicts do not depend on them.",
             draw=partial(curves.histories, found, run.solvers, title),
@@ -347,7 +358,11 @@ def accuracy(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         name="accuracy",
         head=("form", "solver", *(f"tol {tolerance(t)}" for t in tolerances)),
         rows=tuple(
-            (form, clean(s, 40), *(_accuracy(data, (form, s, t)) for t in tolerances))
+            (
+                short_name(form),
+                short_name(s),
+                *(_accuracy(data, (form, s, t)) for t in tolerances),
+            )
             for form, s in sorted(rows_of, key=lambda key: run.solvers.index(key[1]))
         ),
         caption="Error of the verified answers, relative to the solution in the energy "

@@ -459,12 +459,12 @@ def test_a_figure_of_the_report_is_drawn(results, tmp_path):
 
     assert figure.axes
     assert (tmp_path / "a.svg").read_text("utf-8").startswith("<?xml")
-    assert results.plot("scaling").axes  # short for scaling-1, the only such figure
+    assert results.plot("scaling").axes
 
 
 def test_an_unknown_figure_is_refused_with_the_available_ones(results, tmp_path):
     with pytest.raises(mb.InputError, match=r"unknown figure 'acuracy'; did you mean "
-                       r"'accuracy'\? known: accuracy, .*scaling-1"):  # fmt: skip
+                       r"'accuracy'\? known: accuracy, answer, .*scaling"):  # fmt: skip
         results.plot("acuracy")
     with pytest.raises(mb.InputError, match=r"unknown format '\.txt'"):
         results.plot("accuracy", tmp_path / "a.txt")

@@ -127,7 +127,7 @@ def test_bodies_without_contact_are_written_too(tmp_path):
 def test_a_solved_case_is_written_without_nan_and_its_contact_balances(tmp_path):
     params = dict(Nr=2, Nh=1, steps=1)
     family = PROBLEMS["beam-ring"]
-    case = family.build("dual-bounds", family.complete(params), reference_solution)
+    case = family.with_keys(**params).build("dual-bounds", reference_solution)
     s = SOLVERS["clarabel"].prepare(case.qp, 1e-8)()
     write_vtu(case.fields(s), tmp_path / "a.vtu")
     data = meshio.read(tmp_path / "a.vtu").point_data
@@ -243,8 +243,8 @@ def test_contact_takes_precedence_over_sliding_without_contact(tmp_path):
 
 def test_friction_on_open_nodes_does_not_count_as_contact(tmp_path):
     family = PROBLEMS["beam-ring"]
-    params = family.complete(dict(Nr=4, Nh=2, steps=1, friction="tresca", bound=1e8))
-    case = family.build("dual-bounds", params, reference_solution)
+    configured = family.with_keys(Nr=4, Nh=2, steps=1, friction="tresca", bound=1e8)
+    case = configured.build("dual-bounds", reference_solution)
     s = reference_solution(case.qp)
     write_vtu(case.fields(s), tmp_path / "a.vtu")
     data = meshio.read(tmp_path / "a.vtu").point_data

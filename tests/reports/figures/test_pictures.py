@@ -1,27 +1,14 @@
 """Pictures of two rectangles, compared with the fields that they show."""
 
-import re
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from matplotlib.collections import TriMesh
-from matplotlib.figure import Figure as Canvas
 from matplotlib.quiver import Quiver
 
 from mortarbench.harness import ContactSide, Fields, InputError
-from mortarbench.reports.document.fields import (
-    ColourField,
-    FieldFigure,
-    FieldPanel,
-    Label,
-    Polygons,
-    Strokes,
-    Vectors,
-)
-from mortarbench.reports.document.figure import Axis, Figure, Panel, Row, Series
-from mortarbench.reports.document.layout import Page, Picture, Section
 from mortarbench.reports.figures.deformed import (
     FRICTION,
     automatic_scale,
@@ -30,11 +17,10 @@ from mortarbench.reports.figures.deformed import (
     outlines,
     triangles,
 )
-from mortarbench.reports.figures.style import look
-from mortarbench.reports.figures.tractions import traction_figure
-from mortarbench.reports.render.saving import ENDINGS, draw, save, save_all
-from mortarbench.reports.render.svg import inline
-from mortarbench.reports.render.writing import write_page
+from mortarbench.reports.figures.drawing import draw_fields
+from mortarbench.reports.figures.fields import ColourField, Label, Strokes, Vectors
+from mortarbench.reports.figures.style import look, save
+from mortarbench.reports.figures.tractions import loaded_sides
 
 LOWER, UPPER = 3, 6  # columns of cells
 
@@ -100,7 +86,7 @@ def test_cells_that_meet_in_one_node_only_keep_their_sides():
 
 
 def test_bodies_are_drawn_at_their_displaced_positions(bodies):
-    axes = draw(deformed_figure(bodies)).axes[0]
+    axes = draw_fields(deformed_figure(bodies)).axes[0]
     moved = bodies.points + bodies.displacement
     for mesh, nodes in zip(artists(axes, TriMesh), (8, 14), strict=True):
         drawn = mesh._triangulation
@@ -116,7 +102,7 @@ def test_bodies_are_drawn_at_their_displaced_positions(bodies):
 
 
 def test_two_triangles_cover_each_quadrilateral(bodies):
-    meshes = artists(draw(deformed_figure(bodies)).axes[0], TriMesh)
+    meshes = artists(draw_fields(deformed_figure(bodies)).axes[0], TriMesh)
     # The shear by −0.05 x preserves areas and moves the centre (1, y) to (1, y − 0.05).
     for mesh, area, middle in zip(meshes, (0.8, 0.6), (0.15, 0.55), strict=True):
         t = mesh._triangulation
@@ -137,7 +123,7 @@ def test_all_bodies_share_one_scale_despite_a_singularity(bodies):
         points=points, cells=bodies.cells, bodies=bodies.bodies,
         displacement=np.zeros_like(points), nodal={"von_mises": many},
     )  # fmt: skip
-    meshes = artists(draw(deformed_figure(fields)).axes[0], TriMesh)
+    meshes = artists(draw_fields(deformed_figure(fields)).axes[0], TriMesh)
     limits = {mesh.get_clim() for mesh in meshes}
     assert len(limits) == 1
     low, high = limits.pop()
@@ -147,7 +133,7 @@ def test_all_bodies_share_one_scale_despite_a_singularity(bodies):
 
 
 def test_arrows_end_at_loaded_nodes_in_the_direction_of_the_force(bodies):
-    overview, zoom = draw(deformed_figure(bodies)).axes[:2]
+    overview, zoom = draw_fields(deformed_figure(bodies)).axes[:2]
     assert not artists(overview, Quiver)
     (arrows,) = artists(zoom, Quiver)
     moved = bodies.points + bodies.displacement
@@ -348,14 +334,14 @@ def test_triangles_are_drawn_once_without_degenerate_edges():
 
 
 def test_without_contact_forces_there_is_one_panel(bodies):
-    figure = draw(deformed_figure(unloaded(bodies)))
+    figure = draw_fields(deformed_figure(unloaded(bodies)))
     assert len(figure.axes) == 2  # bodies and colour bar
     assert "displacement × 1" in figure.axes[0].get_title(loc="left")
 
 
 def test_without_stress_bodies_have_a_uniform_colour(bodies):
     fields = Fields(**{**vars(unloaded(bodies)), "nodal": {}})
-    figure = draw(deformed_figure(fields))
+    figure = draw_fields(deformed_figure(fields))
     assert len(figure.axes) == 1
     assert len(artists(figure.axes[0], TriMesh)) == 2
 
@@ -371,15 +357,15 @@ def test_without_stress_bodies_have_a_uniform_colour(bodies):
 )
 def test_pictures_have_reproducible_bytes(bodies, tmp_path, ending, start):
     first, second = tmp_path / f"a.{ending}", tmp_path / f"b.{ending}"
-    save(deformed_figure(unloaded(bodies)), first)
-    save(deformed_figure(unloaded(bodies)), second)
+    save(draw_fields(deformed_figure(unloaded(bodies))), first)
+    save(draw_fields(deformed_figure(unloaded(bodies))), second)
     assert first.read_bytes().startswith(start)
     assert first.read_bytes() == second.read_bytes()
 
 
 def test_an_unknown_picture_format_is_refused(bodies, tmp_path):
     with pytest.raises(InputError, match=r"'\.gif'.*known: \.pdf, \.png, \.svg$"):
-        save(deformed_figure(bodies), tmp_path / "a.gif")
+        save(draw_fields(deformed_figure(bodies)), tmp_path / "a.gif")
 
 
 def test_states_with_nan_are_not_drawn(bodies):
@@ -398,67 +384,10 @@ def test_bodies_without_extent_are_not_drawn(bodies):
 
 
 def test_fifty_solvers_look_different_from_each_other():
-    looks = {(look(i).colour, look(i).marker) for i in range(50)}
+    names = [f"solver {i}" for i in range(50)]
+    looks = {(of["color"], of["marker"]) for of in (look(names, n) for n in names)}
 
     assert len(looks) == 50
-
-
-def a_line():
-    series = Series(x=(1, 2), y=(3, 4), look=look(0))
-    panel = Panel(x=Axis(), y=Axis(), marks=(series,))
-    return Figure(rows=(Row(panels=(panel,)),), height=3)
-
-
-def test_a_figure_is_laid_out_only_once(tmp_path, monkeypatch):
-    drawings = []
-    draw = Canvas.draw
-    monkeypatch.setattr(Canvas, "draw", lambda *a: (drawings.append(1), draw(*a)))
-    picture = Picture(name="line", caption="A line.", figure=a_line())
-    section = Section(name="line", title="A line", pictures=(picture,))
-    page = Page(title="One figure", dateline="", sections=(section,))
-    write_page(page, tmp_path, {"html", "md"})
-    assert len(drawings) == len(ENDINGS)
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_one_file_is_drawn_once_and_its_figure_can_be_laid_out_again(
-    tmp_path, monkeypatch, ending
-):
-    drawings = []
-    draw_ = Canvas.draw
-    monkeypatch.setattr(Canvas, "draw", lambda *a: (drawings.append(1), draw_(*a)))
-    figure = save(a_line(), tmp_path / f"a{ending}")
-    assert len(drawings) == 1
-
-    def margins(figure):
-        figure.set_size_inches(2, 2)
-        figure.draw_without_rendering()
-        return figure.axes[0].get_position().bounds
-
-    assert margins(figure) == pytest.approx(margins(draw(a_line())), abs=0.005)
-
-
-def test_the_page_shows_the_drawing_of_the_file_in_the_frame_of_the_whole_figure(
-    tmp_path,
-):
-    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * [2.0, 1.0]
-    panel = FieldPanel(
-        low=(-1, -1), high=(3, 2), axes="none",
-        marks=(Polygons(corners=(square,), fill="#123456"),),
-    )  # fmt: skip
-    figure = FieldFigure(panels=(panel,), width=6, height=3)
-    paths, svg = save_all(figure, tmp_path, "frame")
-    page = inline(svg, "frame")
-    box = re.search('viewBox="(.*?)"', page)[1].split()
-    left, top, width, height = map(float, box)
-    body = page[page.index('d="', page.rindex("<g", 0, page.index("#123456"))) :]
-    corners = np.array(re.findall(r"[ML] (\S+) (\S+)", body), dtype=float)[:4]
-    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2 - (left, top)
-    assert (width, height) == (6 * 72, 3 * 72)
-    assert middle == pytest.approx([width / 2, height / 2], abs=1)
-    assert paths[ENDINGS.index(".svg")].read_text() == svg.text
-    assert "#ffffff" in svg.text
-    assert "#ffffff" not in page
 
 
 def test_bodies_in_3d_have_no_tractions_along_a_line(bodies):
@@ -469,5 +398,5 @@ def test_bodies_in_3d_have_no_tractions_along_a_line(bodies):
         bodies, points=lifted(bodies.points), displacement=lifted(bodies.displacement)
     )
     loaded = (side("up on low", [4, 5], [[0, 0], [0, -3e6]]),)
-    assert traction_figure(replace(bodies, contacts=loaded)) is not None
-    assert traction_figure(replace(space, contacts=loaded)) is None
+    assert loaded_sides(replace(bodies, contacts=loaded)) == [*loaded]
+    assert loaded_sides(replace(space, contacts=loaded)) == []

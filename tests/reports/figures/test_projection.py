@@ -6,8 +6,9 @@ import pytest
 from mortarbench.harness import ContactSide, Fields
 from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.fem.mesh import Mesh, box, join
-from mortarbench.reports.document.fields import ColourScale, Faces, Label, Path, Vectors
 from mortarbench.reports.figures.deformed import deformed_figure
+from mortarbench.reports.figures.drawing import draw_fields
+from mortarbench.reports.figures.fields import ColourScale, Faces, Label, Path, Vectors
 from mortarbench.reports.figures.projection import (
     camera_above,
     camera_seeing,
@@ -16,7 +17,6 @@ from mortarbench.reports.figures.projection import (
     face_normals,
     visible_faces,
 )
-from mortarbench.reports.render.drawing import draw_fields
 from tests.support.hexahedra import TETRAHEDRA, WEDGES, degenerate, divided
 
 CUBE = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2, 2, 2))

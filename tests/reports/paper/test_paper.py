@@ -50,7 +50,7 @@ def experiment():
 def data(tmp_path_factory):
     """Return a folder that contains only measurements of suites."""
     path = tmp_path_factory.mktemp("paper")
-    for name, records in planted().items():
+    for name, records in suite_records().items():
         with Journal(path / "data" / name, "here") as journal:
             for record in records:
                 journal.append(record)
@@ -59,7 +59,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def document(data, experiment):
-    suites = {n: read_measurements(data / "data" / n) for n in planted()}
+    suites = {n: read_measurements(data / "data" / n) for n in suite_records()}
     return compose(experiment, suites)
 
 
@@ -81,7 +81,7 @@ def record(solver, form, m, seconds, repeat, **changes):
     return Record(**(given | changes))
 
 
-def planted():
+def suite_records():
     """Return the records of two suites.
 
     In `paper-fleet`, times are about 1e-6·m² s; at the largest size, `lazy` returns a
@@ -271,7 +271,7 @@ def test_solvers_are_compared_at_equal_certified_error(document):
 @pytest.mark.slow
 def test_all_figures_are_drawn_to_files_with_equal_bytes(data, experiment, tmp_path):
     (tmp_path / "data").mkdir()
-    for name in planted():
+    for name in suite_records():
         (tmp_path / "data" / name).symlink_to(data / "data" / name)
     files, again = (write_paper(p, experiment) for p in (data, tmp_path))
 

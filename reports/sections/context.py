@@ -22,6 +22,7 @@ from mortarbench.reports.document import (
     clean,
     number,
     plural,
+    short_name,
     tolerance,
 )
 from mortarbench.reports.figures.bodies import description, fields_figure
@@ -129,23 +130,10 @@ def settings(run: Measurements, rows: list[Row]) -> Iterator[Item]:
     del rows
     df = run.df
     options = df.drop_duplicates("solver").set_index("solver").options
-    yield Table(
-        name="options",
-        head=("solver", "options"),
-        rows=tuple(
-            (
-                clean(s, 40),
-                clean(", ".join(f"{k} = {v}" for k, v in options[s].items()), 400),
-            )
-            for s in run.solvers
-        ),
-        caption="Options of the solvers, including defaults.",
-        texts=2,
-    )
     tolerances = sorted(set(df.tol), reverse=True)
     sessions = plural(df.session.nunique(), "session")
     repeats = df.groupby(["case", "solver", "tol"]).size().max()
-    lines: dict[str, Any] = {
+    lines = {
         "tolerances": ", ".join(map(tolerance, tolerances)),
         "verified if every residual ≤": f"{run.factor:g} · tolerance",
         "repeats": f"{repeats} in {sessions}, {df.started.min()} to {df.started.max()}",
@@ -153,23 +141,24 @@ def settings(run: Measurements, rows: list[Row]) -> Iterator[Item]:
     if run.suite:
         time, memory = run.suite.time_limit, run.suite.memory_limit
         lines["limits"] = f"{time:g} s, {memory:g} MiB"
+    lines |= {f"options of {s}": _in_a_line(options[s]) for s in run.solvers}
     environments = [e for e in run.environments.values() if e]
     if environments:
         lines |= {k: _in_a_line(v) for k, v in environments[0].items()}
     yield Table(
-        name="environment",
+        name="settings",
         head=("setting", "value"),
         rows=tuple(
-            (clean(str(k), 60), clean(str(v), 800))
+            (clean(str(k), 60), clean(v, 800))
             for k, v in lines.items()
             if v and k != "digest"
         ),
-        caption="Settings and environment; times of the start in UTC.",
+        caption="Settings, options including defaults, and environment; times in UTC.",
         texts=2,
     )
     for other in environments[1:]:
         changed = "; ".join(
-            f"{key}: {clean(str(a), 40)} → {clean(str(b), 40)}"
+            f"{key}: {short_name(str(a))} → {short_name(str(b))}"
             for key, a, b in islice(differences(environments[0], other), 12)
         )
         yield f"A further environment differs in {changed}."

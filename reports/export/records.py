@@ -1,4 +1,4 @@
-"""Measurements as a Parquet table with typed columns, for pandas, R, DuckDB etc."""
+"""Measurements as Parquet and CSV tables, for pandas, R, DuckDB and spreadsheets."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.files.csvfile import safe
+from mortarbench.harness.files.durable import replace_file, replacing
 from mortarbench.harness.results.frame import with_texts
 
 #: Parquet types by type of the column; all other columns are text
@@ -21,7 +22,7 @@ _TYPES = {
 }
 
 
-def write_records(path: Path, df: pd.DataFrame) -> Path:
+def write_parquet(path: Path, df: pd.DataFrame) -> Path:
     """Write the measurements of a report, with one more column for each key of a case.
 
     The types of columns do not depend on values, so that tables of several result
@@ -41,6 +42,17 @@ def write_records(path: Path, df: pd.DataFrame) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         pq.write_table(table, file, compression="zstd")
+    return path
+
+
+def write_csv(path: Path, df: pd.DataFrame) -> Path:
+    """Write the same columns as CSV that is safe to open in spreadsheets."""
+    frame = with_texts(with_keys(df))
+    texts = frame.loc[:, [str(t) not in _TYPES for t in frame.dtypes]]
+    frame = frame.assign(**texts.map(safe, na_action="ignore"))
+    frame = frame.rename(columns=safe)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(path, frame.to_csv(index=False, lineterminator="\n").encode())
     return path
 
 
