@@ -81,6 +81,27 @@ def test_every_formula_of_a_page_becomes_mathml(name):
     assert "$" not in re.sub(r"<(code|pre)\b.*?</\1>", "", after, flags=re.S)
 
 
+@cache
+def anchors_of(name):
+    """Return the identifiers of a page to which links may point."""
+    generated = {"families.md": pages.family_page, "records.md": pages.record_page}
+    text = generated[name]() if name in generated else SOURCES[name].read_text("utf-8")
+    return set(re.findall(r' id="([^"]+)"', pages.typeset(rendered(text))))
+
+
+@pytest.mark.parametrize("name", sorted(SOURCES))
+def test_every_link_into_a_page_has_a_target(name):
+    text = SOURCES[name].read_text("utf-8")
+    links = re.findall(r"\]\((?!\w+:)([^)#\s]*)#([^)\s]+)\)", text)
+    lost = [
+        f"{page}#{anchor}"
+        for page, anchor in links
+        if anchor not in anchors_of(page.rpartition("/")[2] or name)
+    ]
+
+    assert lost == []
+
+
 @pytest.mark.parametrize("name", sorted(SOURCES.keys() - UNICODE))
 def test_no_formula_of_a_page_is_plain_text(name):
     """Outside of code, the characters of `FORMULA` occur only in LaTeX. Other symbols,
