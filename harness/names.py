@@ -92,18 +92,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     ('beam-ring/Nr=4/Nh=15/dual', 10)
 
     """
-    if not isinstance(text, str):
-        raise InputError(
-            f"case = {shown(text)}; expected its name as a string, such as "
-            "beam-ring/Nr=4/Nh=3/dual, or file:PATH"
-        )
-    head = re.split("[:/]", text, maxsplit=1)[0]
-    if head not in families:
-        if (named := _as_file(text, families)) is not None:
-            raise InputError(
-                f"unknown family {shown(head)}; did you mean {shown(named)}, a file?"
-            )
-        raise unknown("family", head, families, more=PLUGINS)
+    head = family_name(text, families)
     family = families[head]
     if (suffix := family.path_suffix) is None:
         parts, given = text.split("/")[1:], {}
@@ -127,6 +116,30 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
             raise InputError(f"{head}: key {shown(key)} is set twice; set it once")
         given[key] = value
     return assemble(head, family, given, parts[-1], texts=True)
+
+
+def family_name(text: str, families: Mapping[str, Family]) -> str:
+    """Return the family in a case name, without importing the family.
+
+    Raises
+    ------
+    InputError
+        If the family is unknown.
+
+    """
+    if not isinstance(text, str):
+        raise InputError(
+            f"case = {shown(text)}; expected its name as a string, such as "
+            "beam-ring/Nr=4/Nh=3/dual, or file:PATH"
+        )
+    head = re.split("[:/]", text, maxsplit=1)[0]
+    if head not in families:
+        if (named := _as_file(text, families)) is not None:
+            raise InputError(
+                f"unknown family {shown(head)}; did you mean {shown(named)}, a file?"
+            )
+        raise unknown("family", head, families, more=PLUGINS)
+    return head
 
 
 def _as_file(text: str, families: Mapping[str, Family]) -> str | None:

@@ -18,16 +18,25 @@ from mortarbench.case import Case, as_case
 from mortarbench.harness import Record, Solver, Verdict, checked
 from mortarbench.harness.distributed.mpi import ranks_asked, too_few_parts
 from mortarbench.harness.errors import InputError, shown
-from mortarbench.harness.names import assemble
+from mortarbench.harness.names import assemble, family_name
 from mortarbench.harness.processes.scratch import scratch_folder, single_worker
 from mortarbench.harness.processes.solver_file import write_solver
 from mortarbench.harness.processes.termination import ended_by_signals
 from mortarbench.harness.record import finite
-from mortarbench.harness.registry import SolverSpec, check_solver, options_of, resolve
+from mortarbench.harness.registry import (
+    SolverSpec,
+    check_name,
+    check_solver,
+    options_of,
+    resolve,
+)
+from mortarbench.harness.suite.solver_options import typed
 from mortarbench.registries import (
     TURN,
     Plugins,
+    Registries,
     defer_parts_of_numpy,
+    load_registries,
     one_thread,
     with_history,
 )
@@ -37,8 +46,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mortarbench.harness import Fields, Residuals, Solution
+    from mortarbench.harness.processes.supervisor import WorkerProcess
     from mortarbench.harness.solution import History
-    from mortarbench.harness.verify.kkt import Normality
 
 PICTURES = (".png", ".pdf", ".svg")  #: suffixes of pictures
 GRIDS = (".vtu", ".pvd")  #: suffixes of ParaView files: one state, or all steps
@@ -97,34 +106,13 @@ class Answer:
 
         return self.solution is not None and has_point(self.solution)
 
-    @property
-    def normality(self) -> Normality | None:
-        """Additional error measures for discs and cones.
-
-        None if the QP has no such sets, the case has not been built in this process, or
-        the solver returned no point.
-        """
-        if "family_case" not in vars(self.case) or not self.has_point:
-            return None
-        from mortarbench.harness.verify.kkt import allowed, normality
-
-        assert self.solution is not None
-        with one_thread():
-            qp = self.case.family_case.qp
-            return normality(qp, self.solution, allowed(self.record.tol))
-
     def to_dict(self) -> dict[str, Any]:
-        """Return the record, the history and the remarks as plain data.
-
-        The values of `normality` are included unless it is None.
-        """
+        """Return the record, the history and the remarks as plain data."""
         from mortarbench.harness.verify.verdicts import plain
 
         history = finite(plain(self.history))
-        further = self.normality
         return {
             **json.loads(self.record.to_json()),
-            **({} if further is None else finite(further._asdict())),
             "history": history,
             "remarks": [*self.remarks],
         }
@@ -262,6 +250,7 @@ def solve(
     plugins: Plugins = (),
     ranks: Annotated[int, "--mpi --ranks N"] = 1,
     time_limit: Annotated[float, "SECONDS"] = TIME_LIMIT,
+    registries: Registries | None = None,
     **more: Any,
 ) -> Answer:
     """Run one solver on one case in a separate process, and verify its answer.
@@ -277,12 +266,15 @@ def solve(
     solver : a name from `list solvers`. In Python also an object with the methods
         `declines` and `prepare`
     tol : requested relative KKT accuracy
-    options : options of the solver that differ from its defaults. A solver with an
-        option ``history`` records its iterations unless ``history = False`` is passed
+    options : options of the solver that differ from its defaults; a text is converted
+        to the type of the option. A solver with an option ``history`` records its
+        iterations unless ``history = False`` is passed
     plugins : Python files with more solvers or families
     ranks : number of MPI processes that jointly solve the case; more than 1 only for
         cases that are decomposed into subdomains
     time_limit : limit for the solve in s
+    registries : used for a name instead of built-in registries, installed plug-ins and
+        `plugins`
     more : further options of the solver, as keyword arguments
 
     Raises
@@ -308,11 +300,16 @@ def solve(
     if not isinstance(solver, str):
         with checked.located("solver"):
             check_solver(solver)
-    problem = as_case(case, plugins)
+    if not isinstance(case, str):
+        case = as_case(case, plugins)
+        registries = case.registries
+    registries = load_registries(plugins, registries)
+    if isinstance(case, str):
+        family_name(case, registries.families)
     ranks_asked(ranks, "ranks")
     time_limit = checked.positive("time_limit", time_limit)
-    registries = problem.registries
     if isinstance(solver, str):
+        check_name(solver, registries.solvers)
         name, solvers = solver, registries.solvers
     else:
         name = type(solver).__name__
@@ -320,10 +317,10 @@ def solve(
     spec = SolverSpec(name=name, label=name, options=requested).on(ranks)
     parts = ranks
     if ranks > 1:
-        parts = problem.id.family.subdomains(problem.form)
-    solution: Solution | None = None
-    notes: tuple[str, ...] = ()
+        divided = as_case(case, registries=registries).id
+        parts = divided.family.subdomains(divided.form)
     with ExitStack() as stack:
+        worker = None
         if parts >= ranks:
             scratch = stack.enter_context(scratch_folder())
             copy = None if isinstance(solver, str) else scratch / "solver.pickle"
@@ -333,14 +330,12 @@ def solve(
             # The worker imports its libraries while this process imports its own.
             worker = stack.enter_context(single_worker(command))
         defer_parts_of_numpy()
+        problem = as_case(case, registries=registries)
 
         from mortarbench.harness.environment.environment import digest
-        from mortarbench.harness.processes.measurement import measure_once
-        from mortarbench.harness.processes.protocol import Source
         from mortarbench.harness.verify.verdicts import new_record
-        from mortarbench.verification import remarks
 
-        spec = with_history(spec, solvers)
+        spec = with_history(typed(spec, solvers), solvers)
         plain = SolverSpec(name=name, label=name)
         default = plain if "history" in requested else with_history(plain, solvers)
         record = new_record(
@@ -351,26 +346,13 @@ def solve(
             repeat=0,
             environment=digest(registries.environment()),
         )
-        if parts < ranks:
+        solution: Solution | None = None
+        notes: tuple[str, ...] = ()
+        if worker is None:
             message = too_few_parts(parts, ranks)
             record = record.replace(status=Verdict.DECLINED, message=message)
         else:
-            ours = registries.hold_only_builtins()
-            by_ranks = Source.RANKS if ours else Source.SHARES
-            # Code of a family may print, and standard output is reserved for the answer
-            stack.enter_context(one_thread())
-            stack.enter_context(redirect_stdout(stderr))
-            record, solution = measure_once(
-                worker,
-                lambda: problem.family_case,
-                record,
-                registries.reference,
-                source=by_ranks if ranks > 1 else Source.FILE,
-                time_limit=time_limit,
-            )
-            # remarks on the input are known only if this process has built the case
-            notes = problem.remarks if "family_case" in vars(problem) else ()
-            notes = (*notes, *remarks(problem, record, solution))
+            record, solution, notes = _measured(worker, problem, record, time_limit)
     return Answer(
         case=problem,
         record=record,
@@ -380,6 +362,33 @@ def solve(
         defaults=options_of(resolve(default, solvers)),
         remarks=notes,
     )
+
+
+def _measured(
+    worker: WorkerProcess, problem: Case, record: Record, time_limit: float
+) -> tuple[Record, Solution | None, tuple[str, ...]]:
+    """Measure once; return the record, the answer, and remarks."""
+    from mortarbench.harness.processes.measurement import measure_once
+    from mortarbench.harness.processes.protocol import Source
+    from mortarbench.verification import remarks
+
+    source = Source.FILE
+    if record.ranks > 1:
+        own = problem.registries.hold_only_builtins()
+        source = Source.RANKS if own else Source.SHARES
+    # Code of a family may print, and standard output is reserved for the answer
+    with one_thread(), redirect_stdout(stderr):
+        record, solution = measure_once(
+            worker,
+            lambda: problem.family_case,
+            record,
+            problem.registries.reference,
+            source=source,
+            time_limit=time_limit,
+        )
+        # remarks on the input are known only if this process has built the case
+        notes = problem.remarks if "family_case" in vars(problem) else ()
+        return record, solution, (*notes, *remarks(problem, record, solution))
 
 
 def check_scale(scale: float) -> float:

@@ -17,6 +17,7 @@ from mortarbench.harness.processes.ranks import launch
 from mortarbench.harness.processes.solver_file import read_solver
 from mortarbench.harness.processes.worker import Worker, serve
 from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.suite.solver_options import typed
 from mortarbench.registries import Registries, with_history
 
 
@@ -35,6 +36,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         if "copy" in request:
             solvers = {name: read_solver(Path(request["copy"]))}
         spec = SolverSpec(name=name, label=name, options=request["options"])
+        spec = typed(spec, solvers)
         if request["records"]:
             spec = with_history(spec, solvers)
         solver = resolve(spec, solvers)

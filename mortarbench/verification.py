@@ -13,10 +13,8 @@ from mortarbench.case import Case, as_case
 from mortarbench.harness import QP, Record, Residuals, Solution, Verdict, checked
 from mortarbench.harness.qp import Vector, numeric_vector
 from mortarbench.harness.verify.kkt import (
-    Normality,
     allowed,
     kkt_residuals,
-    normality,
     verdict,
 )
 from mortarbench.harness.verify.multipliers import with_multipliers
@@ -52,8 +50,6 @@ class Verification:
     #: multipliers passed to `verify`; those left out are computed
     multipliers: Multipliers
     objective: float  #: ½xᵀPx + qᵀx
-    #: additional error measures for discs and cones; None if the QP has no such sets
-    normality: Normality | None
     tol: float  #: relative KKT accuracy, as passed to `verify`
 
     def __repr__(self) -> str:
@@ -117,7 +113,6 @@ def verify(
         residuals=residuals,
         multipliers=Multipliers(s.y, s.z, s.z_box),
         objective=objective,
-        normality=normality(problem, s, allowed(tol)),
         tol=tol,
     )
 

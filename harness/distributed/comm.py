@@ -14,7 +14,6 @@ as threads, is one more class with these members.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -196,12 +195,9 @@ class _MPIComm(Comm):
         return tuple(order)
 
     def abort(self, failure: BaseException) -> NoReturn:
-        entry = {
-            "rank": self.rank,
-            "failed": self._named(self.rank, in_a_line(failure)),
-        }
+        line = self._named(self.rank, in_a_line(failure))
         with suppress(OSError, KeyError):  # a single write does not interleave
-            os.write(int(os.environ[RECORD]), f"{json.dumps(entry)}\n".encode())
+            os.write(int(os.environ[RECORD]), f"{line}\n".encode())
         with suppress(OSError, ValueError):  # a solver may have closed stderr
             traceback.print_exception(failure)
             sys.stderr.flush()

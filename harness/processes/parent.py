@@ -8,9 +8,9 @@ it adopts each descendant whose parent ends, so that neither a double fork nor s
 removes a process from the tree. The tree is killed when COMMAND ends, when the script
 receives SIGTERM, and when the process RUN has ended.
 
-Run as ``parent.py rank RECORD COMMAND…``, the script is the parent of one MPI rank: it
-starts COMMAND, writes the IDs of both processes, and later the wait status of COMMAND,
-to the file descriptor RECORD, and exits with the same code or signal.
+Run as ``parent.py rank RECORD RANKS COMMAND…``, the script is the parent of one of
+RANKS MPI ranks: it runs COMMAND, writes a line with the rank and its exit code or
+signal to the file descriptor RECORD, and exits with the same code or signal.
 
 The process of the run is not a sub-reaper itself: if it were killed, it could not clean
 up, and in a Python session it would adopt unrelated processes.
@@ -53,7 +53,7 @@ def descendants(root: int) -> list[int]:
 def main(arguments: list[str]) -> None:
     """Run the command, kill its descendants, and exit with its code or signal."""
     if arguments[0] == "rank":
-        _record_rank(int(arguments[1]), arguments[2:])
+        _record_rank(int(arguments[1]), arguments[2], arguments[3:])
     run, cpu, requests, replies, *command = arguments
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
@@ -78,14 +78,16 @@ def main(arguments: list[str]) -> None:
     _end_as(ended.get(worker, 0))
 
 
-def _record_rank(record: int, command: list[str]) -> None:
+def _record_rank(record: int, ranks: str, command: list[str]) -> None:
     rank = next((os.environ[name] for name in _RANKS if name in os.environ), "-1")
-    child = _start(command)
-    line = f'{{"rank": {rank}, "processes": [{child}, {os.getpid()}]}}\n'
-    os.write(record, line.encode())  # short lines of ranks do not interleave
-    status = os.waitpid(child, 0)[1]
+    status = os.waitpid(_start(command), 0)[1]
+    code = os.waitstatus_to_exitcode(status)
+    how = f"exit code {code}"
+    if code < 0:
+        how = f"{signal.strsignal(-code)} (signal {-code})"
+    line = f"rank {rank} of {ranks} ranks ended: {how}"
     with suppress(BrokenPipeError):  # the reader ends after the first rank has ended
-        os.write(record, f'{{"rank": {rank}, "status": {status}}}\n'.encode())
+        os.write(record, f"{line}\n".encode())  # short lines do not interleave
     _end_as(status)
 
 

@@ -13,15 +13,13 @@ all ranks compute together (`harness.distributed.comm`).
 
 from __future__ import annotations
 
-import json
 import os
-import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from select import EPOLLIN, epoll
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -50,11 +48,11 @@ from mortarbench.harness.verify.verdicts import evaluated, has_point
 def launch(ranks: int, command: Sequence[str]) -> int:
     """Run `command` on several MPI ranks, and report on stderr if a rank failed.
 
-    A parent process of each rank records how the rank ended
-    (`harness.processes.parent`). If one rank ends while others are running, the other
-    ranks are ended, whatever the exit code. The message therefore names the rank that
-    ended first. The output of the ranks is not parsed, since its lines may be
-    interleaved.
+    A parent process of each rank writes a line when the rank has ended
+    (`harness.processes.parent`), and mpiexec ends the other ranks after that. The first
+    line therefore names the rank that ended first. The other ranks are also ended,
+    after `PEER_TIMEOUT`, if the rank exits with 0. The output of the ranks is not
+    parsed, since its lines may be interleaved.
 
     command : command line; its last two elements are file descriptors, which the ranks
         inherit
@@ -73,7 +71,7 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     read, write = os.pipe()
     above = [sys.executable, "-I", "-S", parent.__file__, "rank", str(write)]
     process = subprocess.Popen(
-        [start, "-n", str(ranks), *above, *command],
+        [start, "-n", str(ranks), *above, str(ranks), *command],
         stdin=subprocess.DEVNULL,
         pass_fds=(*fds, write),
         env=os.environ | {RECORD: str(write)},
@@ -82,90 +80,16 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     # end of file after the ranks or the parent have closed their copies.
     for fd in (*fds, write):
         os.close(fd)
-    first = _RankExits(read, ranks).first(process.pid)
-    code = process.poll()
-    if code != 0 or first:
-        how = first or f"one of {ranks} ranks ended: mpiexec exited with {code}"
-        # The parent quotes the last line of the output. The newline ends a possibly
-        # unfinished line of a rank.
-        print(f"\n{how}", file=sys.stderr)
+    with os.fdopen(read) as records:
+        first = records.readline().strip()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(PEER_TIMEOUT)
+    code = process.returncode
+    # The parent quotes the last line of the output. The newline ends a possibly
+    # unfinished line of a rank.
+    how = first or f"one of {ranks} ranks ended: mpiexec exited with {code}"
+    print(f"\n{how}", file=sys.stderr)
     return 0 if code == 0 else 1
-
-
-class _RankExits:
-    """Exits of the ranks, in chronological order.
-
-    epoll(7) lists file descriptors in the order in which they became ready, even if the
-    caller polls only after several of them are ready. This order identifies the rank
-    that ended first, whereas mpiexec names the lowest-numbered rank that has ended.
-
-    record : pipe from which the records of the parent processes of ranks are read
-    """
-
-    def __init__(self, record: int, ranks: int) -> None:
-        self._record = record
-        self._ranks = ranks
-        self._rank_of: dict[int, int] = {}  # rank by pidfds of its two processes
-        self._first: list[int | str] = []  # ranks that ended, or messages of failures
-        self._ways: dict[int, str] = {}  # descriptions of exits by rank
-        self._events = epoll()
-
-    def first(self, mpiexec: int) -> str:
-        """Wait until mpiexec has ended; describe the exit of the first rank that ended.
-
-        After the first exit, whatever its code, the wait is limited to `PEER_TIMEOUT`.
-        Return "" if mpiexec ended before any rank.
-
-        mpiexec : process ID
-        """
-        mpi, ready, deadline = os.pidfd_open(mpiexec), list[int](), np.inf
-        for fd in (self._record, mpi):
-            self._events.register(fd, EPOLLIN)
-        while mpi not in ready and (left := deadline - time.monotonic()) > 0:
-            ready = [fd for fd, _ in self._events.poll(min(left, PEER_TIMEOUT))]
-            for fd in ready:
-                if fd in self._rank_of:
-                    self._first.append(self._rank_of[fd])
-                    self._events.unregister(fd)
-                elif fd == mpi:  # ranks that end after mpiexec are ended by mpiexec
-                    self._first.append("")
-                else:
-                    self._take_records()
-            if self._first and deadline == np.inf:
-                deadline = time.monotonic() + PEER_TIMEOUT
-        if isinstance(rank := self._first[0], str):
-            return rank
-        way = self._ways.get(rank, "killed together with its parent process")
-        return f"rank {rank} of {self._ranks} ranks ended: {way}"
-
-    def _take_records(self) -> None:
-        """Read all records; each was written at once, so that no line is incomplete."""
-        lines = os.read(self._record, 2**16).splitlines()
-        if not lines:  # all writers have ended
-            self._events.unregister(self._record)
-        for line in map(json.loads, lines):
-            if "failed" in line:
-                self._first.append(line["failed"])
-            elif "status" in line:
-                self._ways[line["rank"]] = _describe_exit(line["status"])
-            else:
-                try:
-                    ends = [os.pidfd_open(number) for number in line["processes"]]
-                except ProcessLookupError:  # ended before its record was read
-                    self._first.append(line["rank"])
-                    continue
-                for end in ends:
-                    self._rank_of[end] = line["rank"]
-                    self._events.register(end, EPOLLIN)
-
-
-def _describe_exit(status: int) -> str:
-    code = os.waitstatus_to_exitcode(status)
-    return (
-        f"{signal.strsignal(-code)} (signal {-code})"
-        if code < 0
-        else f"exit code {code}"
-    )
 
 
 #: builds the case of a request, a mapping with family, params and form; all ranks call

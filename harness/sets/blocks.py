@@ -84,13 +84,6 @@ class Blocks(ABC):
             )
 
     @abstractmethod
-    def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the distance (k,) of z from the normal cone at x in each block.
-
-        tol : largest relative slack for which x counts as a point of the boundary
-        """
-
-    @abstractmethod
     def normals(self, x: Vector) -> tuple[csc_array, Vector]:
         """Return outward normals (n, j) at x (n,) of length ≤ 1, and their slacks (j,).
 

@@ -103,28 +103,6 @@ class Cones(Blocks):
         """Evaluate −zᵀx for each cone, with the admissible part of z."""
         return [-(self.admissible(z) * x)[self.index].sum(axis=1)]
 
-    def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the Euclidean distances (k,) of z from the normal cones of cones at x.
-
-        At the apex, the normal cone is the polar cone. At other points of a cone of
-        positive slope, the normal cone is a ray if x is on the boundary, and {0} if x
-        is inside. For slope 0, it is the plane z_N = 0. A block of x whose norm is at
-        most `tol` times the largest norm of a block counts as the apex.
-        """
-        at, force = x[self.index], z[self.index]
-        sizes, tangents = norms(at), norms(at[:, 1:])
-        pull = self.slope * at[:, 0]
-        is_active = pull - tangents <= tol * (np.abs(pull) + tangents)
-        outward = at / np.where(tangents > 0, tangents, 1)[:, None]
-        outward[:, 0] = -self.slope
-        outward /= np.hypot(1, self.slope)[:, None]
-        along = np.maximum((force * outward).sum(axis=1), 0) * is_active
-        rest = norms(force - along[:, None] * outward)
-        rest = np.where(self.slope > 0, rest, np.abs(force[:, 0]))
-        is_apex = sizes <= tol * sizes.max(initial=0.0)
-        off_polar = norms((z - self.admissible(z))[self.index])
-        return np.where(is_apex, off_polar, rest)
-
     def normals(
         self, x: Vector, force: Vector | None = None
     ) -> tuple[csc_array, Vector]:

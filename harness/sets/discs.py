@@ -87,19 +87,6 @@ class Discs(Blocks):
         """Evaluate r‖z_I‖ − z_Iᵀx_I for each disc."""
         return [self.radius * self._norms(z) - (z * x)[self.index].sum(axis=1)]
 
-    def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the Euclidean distances (k,) of z from the normal cones of discs at x.
-
-        The distance is ‖z_I − max(z_Iᵀn, 0)n‖ with n = x_I/‖x_I‖ at a boundary point,
-        ‖z_I‖ inside the disc, and 0 for radius 0.
-        """
-        at, force, sizes = x[self.index], z[self.index], self._norms(x)
-        outward = at / np.where(sizes > 0, sizes, 1)[:, None]
-        along = np.maximum((force * outward).sum(axis=1), 0)
-        is_active = self.radius - sizes <= tol * self.radius
-        rest = norms(force - (along * is_active)[:, None] * outward)
-        return np.where(self.radius > 0, rest, 0 * rest)
-
     def normals(self, x: Vector) -> tuple[csc_array, Vector]:
         """Return outward normals (n, k) at x (n,), and the slacks r − ‖x_I‖ (k,)."""
         sizes, (k, d) = self._norms(x), self.index.shape

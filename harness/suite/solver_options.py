@@ -104,29 +104,24 @@ def listed_options(options: object) -> dict[str, list[Any]]:
     return values
 
 
-def options_for(
-    name: str, texts: Iterable[str], registry: Mapping[str, Solver]
-) -> dict[str, Any]:
-    """Return the values of the options of one solver by key, from texts ``KEY=VALUE``.
-
-    name : name of the solver in the registry
+def typed(spec: SolverSpec, registry: Mapping[str, Solver]) -> SolverSpec:
+    """Convert texts among the options of a solver to the types of the options.
 
     Raises
     ------
     InputError
-        If an option has several values, is unknown, or has a value that the solver
-        refuses.
+        If an option is unknown, or has a value that the solver refuses.
 
     """
-    given = parse_options(texts)
-    for key, values in given.items():
-        if len(values) > 1:
-            raise InputError(
-                f"--option: {key} has {len(values)} values; expected one value, since "
-                "only `run` measures several"
-            )
-    (spec,) = sweep([SolverSpec(name=name, label=name)], given, registry)
-    return dict(spec.options)
+    texts = {k: v for k, v in spec.options.items() if isinstance(v, str)}
+    if not texts:
+        return spec
+    plain = replace(
+        spec, options={k: v for k, v in spec.options.items() if k not in texts}
+    )
+    given = {key: [text] for key, text in texts.items()}
+    (variant,) = sweep([plain], given, registry)
+    return replace(variant, label=spec.label)
 
 
 def sweep(

@@ -57,19 +57,6 @@ class Residuals(NamedTuple):
         return float(np.max(self))
 
 
-class Normality(NamedTuple):
-    """Distances from optimality for discs and cones; NaN if x contains NaN.
-
-    The complementarity of a disc, r‖z‖ − zᵀx, is of second order in the angle between z
-    and x, whereas these distances are of first order. Verdicts do not depend on these
-    distances: verdicts bound the error of the objective, which is also of second order.
-    """
-
-    natural_map: float  #: ‖x − Π(x − g/L)‖·L/‖q‖, see `normality`
-    #: largest distance of z_box from a normal cone at x, relative to forces
-    normal_distance: float
-
-
 @dataclass(frozen=True, eq=False)
 class Scaling:
     """Factors of the scaled QP in which residuals are relative."""
@@ -308,58 +295,6 @@ def _errors(qp: QP, s: Solution) -> Iterator[_Errors]:
             yield _Errors("complementarity", product(c.name), ratios, c.variable)
     reason = "primal and dual objective differ by {1} of the energy"
     yield _Errors("gap", reason, relative(energies.sum(keepdims=True)))
-
-
-@np.errstate(all="ignore")  # a point may contain NaN, inf, or 1e300
-def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
-    """Return distances of a point from optimality; None without discs and cones.
-
-    * `natural_map` is ‖x − Π(x − g/L)‖·L/‖q‖ with g = Px + q + Aᵀy + Gᵀz, the
-      projection Π onto all sets and an estimate L of the largest eigenvalue of P. It
-      does not depend on z_box. If q = 0, the value is relative to the larger of ‖Px‖
-      and ‖Aᵀy + Gᵀz‖. If P = 0, L is 1.
-    * `normal_distance` is the largest Euclidean distance of z_box on a disc or cone
-      from the normal cone of the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and
-      ‖Aᵀy + Gᵀz + z_box‖∞.
-
-    tol : a disc or cone is active if its relative slack is at most `tol`
-
-    Examples
-    --------
-    The nearest point to (3, 4) in the unit disc, turned by an angle of 10⁻⁴:
-
-    >>> import numpy as np
-    >>> from mortarbench import QP, Discs, Solution, Status
-    >>> from mortarbench.harness.verify.kkt import kkt_residuals, normality
-    >>> qp = QP.from_arrays(np.eye(2), [-3, -4], sets=[Discs([[0, 1]], [1])])
-    >>> c, s = np.cos(1e-4), np.sin(1e-4)
-    >>> x = np.array([[c, -s], [s, c]]) @ [0.6, 0.8]
-    >>> none = np.zeros(0)
-    >>> point = Solution(
-    ...     status=Status.SOLVED, x=x, y=none, z=none, z_box=[3, 4] - x
-    ... )
-    >>> f"{kkt_residuals(qp, point).worst:.0e}"
-    '6e-09'
-    >>> [f"{value:.0e}" for value in normality(qp, point, 1e-8)]
-    ['2e-05', '1e-04']
-
-    """
-    blocks = [one for one in qp.sets[1:] if isinstance(one, Blocks)]
-    if not blocks:
-        return None
-    Px, rows = qp.P @ s.x, qp.A.T @ s.y + qp.G.T @ s.z
-    g, L = Px + qp.q + rows, largest_eigenvalue(qp)
-    moved = s.x - g / L if L > 0 else s.x - g
-    for one in qp.sets:
-        moved = one.project(moved)
-    sizes = [float(np.linalg.norm(v)) for v in (qp.q, Px, rows)]
-    size = sizes[0] or max(sizes) or 1.0
-    force = max(_sup(v) for v in (Px, qp.q, rows + s.z_box)) or 1.0
-    distances = [one.normal_distances(s.x, s.z_box, tol) for one in blocks]
-    return Normality(
-        float(np.linalg.norm(s.x - moved)) * (L or 1.0) / size,
-        float(np.max([np.max(d) for d in distances])) / force,
-    )
 
 
 def largest_eigenvalue(qp: QP) -> float:

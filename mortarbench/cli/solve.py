@@ -13,7 +13,7 @@ from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, say
 from mortarbench.harness.names import assemble
 from mortarbench.harness.registry import check_name
-from mortarbench.harness.suite.solver_options import options_for
+from mortarbench.harness.suite.solver_options import parse_options
 from mortarbench.progress import waiting
 from mortarbench.registries import Registries
 from mortarbench.text import convergence, legend
@@ -53,23 +53,37 @@ def solve(
     files = {"plot": plot, "vtu": vtu, "out": out}
     _check_files(files, scale)
     check_name(solver, registries.solvers)
-    problem = as_case(case, registries=registries)
-    options = options_for(solver, option, registries.solvers)
+    options = {key: _only(key, values) for key, values in parse_options(option).items()}
+    problem: str | mb.Case = case
     pictures = [f"--{name}" for name in ("plot", "vtu") if files[name] is not None]
-    if pictures and problem.family_case.fields is None:
-        raise InputError(
-            f"{problem.name} has no bodies to draw; leave out {', '.join(pictures)}"
-        )
+    if pictures:
+        problem = as_case(case, registries=registries)
+        if problem.family_case.fields is None:
+            raise InputError(
+                f"{problem.name} has no bodies to draw; leave out {', '.join(pictures)}"
+            )
     with waiting() as progress:
         limit = arguments.get("time_limit", TIME_LIMIT)
-        progress(f"solving {problem.name} with {solver}, time limit {limit:g} s")
-        answer = mb.solve(problem, solver, options=options, **arguments)
+        progress(f"solving {case} with {solver}, time limit {limit:g} s")
+        answer = mb.solve(
+            problem, solver, options=options, registries=registries, **arguments
+        )
     _print(answer, json)
     if any(files.values()) and not answer.has_point:
         say(f"no file is written: {solver} returned no point")
     else:
         _write(answer, **files, scale=scale)
     return 0 if answer.verdict.is_verified else 1
+
+
+def _only(key: str, values: Sequence[str]) -> str:
+    """Return the only value of an option; raise InputError if there are several."""
+    if len(values) > 1:
+        raise InputError(
+            f"--option: {key} has {len(values)} values; expected one value, since "
+            "only `run` measures several"
+        )
+    return values[0]
 
 
 def _check_files(files: Mapping[str, str | None], scale: float | None) -> None:

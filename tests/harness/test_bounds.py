@@ -71,15 +71,9 @@ def refused(capsys, monkeypatch, tmp_path):
     ("changed", "expected"),
     [
         ({"tol": 0}, "tol: Expected `float` > 0"),
-        ({"tol": 10**30}, "tol: Expected `float` <= 1"),
-        ({"accuracy": 0.0}, "accuracy: Expected `float` > 0"),
         ({"solve_seconds": -2e-6}, "solve_seconds: Expected `float` >= 0"),
-        ({"total_seconds": 1e308}, "total_seconds: Expected `float` <= 1"),
-        ({"gap": -1.0}, "gap: Expected `float` >= 0"),
         ({"ranks": 0}, "ranks: Expected `int` >= 1"),
         ({"repeat": 10**30}, "repeat: Expected `int` <= "),
-        ({"iterations": -(10**30)}, "iterations: Expected `int` >= 0"),
-        ({"counts": {"steps": 10**400}}, "counts"),
         ({"quantities": {"a": [[2**63]]}}, "quantities[...][0][0]: Expected `int` <="),
         ({"status": "fine"}, "'fine'; expected one of verified, verified_infeasible"),
         ({"params": {"n": [1]}}, "params[...]: Expected `bool | int | float"),
@@ -151,19 +145,6 @@ def test_two_contradictory_lines_on_one_measurement_are_refused(journal):
     )
 
 
-def test_a_report_mentions_repeated_lines_and_refuses_contradictory_ones(
-    journal, refused, capsys
-):
-    folder = journal(record("a"), record("a"))
-    assert main(Registries(), ["report", str(folder), "--format", "csv"]) == 0
-    assert "1 journal line repeats an earlier line" in capsys.readouterr().err
-
-    folder = journal(record("a"), record("a", tol=1e-3))
-    for command in ("report", "validate"):
-        assert "differs from an earlier record" in refused(command, folder)
-    assert "differs from an earlier record" in refused("replay", folder, "a")
-
-
 def test_equal_tables_of_a_journal_are_shared_but_1_and_true_differ(journal):
     a, b, c = read_journal(
         journal(
@@ -224,32 +205,6 @@ def test_invalid_json_is_refused_with_the_name_of_the_file(tmp_path, text):
 
     with pytest.raises(InputError, match=r"a\.json: .*expected"):
         read_json(tmp_path / "a.json")
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ("null_arm = []", "null_arm = []; expected a string or none"),
-        ("repeats = 1_000_000_000_000", "expected an integer <= 1000000"),
-        ("tolerances = [1e-6, 1e-6]", "expected distinct numbers"),
-        ("tolerances = [nan]", "tolerances[0] = nan; expected a number > 0"),
-        ("time_limit = inf", "time_limit = inf; expected a number <= 1.79"),
-        (
-            'null_arm = "a\\u0000b"',
-            "expected a nonempty string without control characters",
-        ),
-        (f"accuracy = {'9' * 4000}", "accuracy = 99"),
-        ("time_limit = 1e400", "time_limit = inf; expected a number <= 1.79"),
-    ],
-)
-def test_odd_values_of_a_suite_are_refused_briefly(tmp_path, change, expected):
-    path = tmp_path / "s.toml"
-    path.write_text(f"{change}\n{SUITE}")
-
-    with pytest.raises(InputError) as e:
-        load_suite(path, PROBLEMS, SOLVERS)
-    assert expected in str(e.value)
-    assert len(str(e.value)) < len(str(path)) + 400
 
 
 def test_a_grid_beyond_the_limit_is_refused_with_the_way_to_raise_the_limit(tmp_path):

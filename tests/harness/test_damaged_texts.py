@@ -34,7 +34,7 @@ from mortarbench.harness.results.folder import environment_of, refuse_other
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.solver_options import (
     listed_options,
-    options_for,
+    parse_options,
     sweep,
 )
 from mortarbench.harness.suite.suite import as_toml, load_suite, read_stored
@@ -324,19 +324,20 @@ def test_damaged_options_are_taken_or_refused(count):
     options = ("max_iter=50", "eps_abs=1e-8", "polish=true", "max_iter=5,10", "rho=")
     for _ in range(count):
         text = damaged_texts.damaged(chance.choice(options), chance)
-        tried(text, lambda text=text: options_for("osqp", [text], SOLVERS))
+        tried(text, lambda text=text: sweep(OSQP, parse_options([text]), SOLVERS))
         value = chance.choice((*damaged_texts.VALUES, *ODD))
         key = chance.choice(("max_iter", "eps_abs", "polish", *ODD))
         tried(
             (key, value),
             lambda key=key, value=value: sweep(
-                [SolverSpec(name="osqp", label="osqp")],
+                OSQP,
                 listed_options({key: value} if isinstance(key, str) else value),
                 SOLVERS,
             ),
         )
 
 
+OSQP = (SolverSpec(name="osqp", label="osqp"),)
 #: values that a Python program may pass by mistake
 ODD = (
     None, True, False, 0, 3, -1, 2.5, float("nan"), float("inf"), 10**400, 1j, "", "x",

@@ -76,15 +76,6 @@ def test_ranges_hold_even_if_a_family_overrides_post_init():
         assemble("careless", Careless(), {"n": 0}, "only")
 
 
-def test_a_case_has_its_name_parameters_and_configured_family():
-    case = parse("doubled/n=3/only", {"doubled": Doubled()})
-
-    assert f"{case}" == case.name == "doubled/n=3/only"
-    assert case.family_name == "doubled"
-    assert case.params["twice"] == 6
-    assert case.family == Doubled(n=3)
-
-
 def test_a_family_must_build_a_case():
     case = parse("doubled/only", {"doubled": Doubled()})
 

@@ -113,45 +113,24 @@ def test_a_canonical_name_parses_to_the_case_that_it_names(form, **params):
         ("ring/Nhh=3/dual", "ring: unknown key 'Nhh'; did you mean 'Nh'? known: "),
         ("ring/Nh=3/Nh=4/dual", "ring: key 'Nh' is set twice; set it once"),
         ("ring/Nh3/dual", "ring: malformed component 'Nh3'; expected key=value"),
-        ("ring//dual", "ring: malformed component ''; expected key=value"),
         ("ring/Nh=x/dual", "ring: Nh='x'; expected an integer, such as 4"),
-        ("ring/Nh=3.0/dual", "ring: Nh='3.0'; expected an integer, such as 4"),
-        ("ring/Nh=1_0/dual", "ring: Nh='1_0'; expected an integer, such as 4"),
-        ("ring/Nh=٣/dual", "ring: Nh='٣'; expected an integer, such as 4"),
         (
             f"ring/Nh={20 * '9'}/dual",
             "ring: Nh=99999999999999999999; expected an integer of at most 64 bits",
         ),
-        (f"ring/Nh={5000 * '9'}/dual", "ring: Nh='9999"),
-        ("RING/dual", "unknown family 'RING'; did you mean 'ring'? known: plain, ring"),
-        ("bring/dual", "unknown family 'bring'; did you mean 'ring'? known"),
         ("an/dual", "unknown family 'an'; known: plain, ring"),
-        ("ring/Nh=True/dual", "ring: Nh='True'; expected an integer, such as 4"),
         (
             "ring/size=wide/dual",
             "ring: size='wide'; expected a finite number, such as 0.5",
-        ),
-        (
-            "ring/size=nan/dual",
-            "ring: size='nan'; expected a finite number, such as 0.5",
         ),
         (
             "ring/plane=/dual",
             "ring: plane=''; expected nonempty text without control characters, / "
             "and =",
         ),
-        (
-            "ring/plane=a=b/dual",
-            "ring: plane='a=b'; expected nonempty text without control characters, / "
-            "and =",
-        ),
         ("ring/Nh=0/dual", "ring: Nh=0 must be at least 1"),
         ("ring/duel", "ring: unknown form 'duel'; did you mean 'dual'?"),
         ("ring/Nh=3", "ring/Nh=3: no form at the end; expected one of primal, dual"),
-        (
-            "ring/size=1e999/dual",
-            "ring: size='1e999'; expected a finite number, such as 0.5",
-        ),
         ("ring", "ring: no form at the end; expected one of primal, dual"),
         ("", "unknown family ''"),
     ],

@@ -86,50 +86,21 @@ def test_an_exact_entry_takes_precedence_over_the_wildcard():
     assert resolve(spec("open:tuned"), SOLVERS).alpha == 9.0
 
 
-def test_an_integer_option_of_a_float_field_becomes_a_float():
-    alpha = resolve(spec("method", alpha=2), SOLVERS).alpha
-
-    assert isinstance(alpha, float)
-
-
-def test_an_option_whose_default_is_none_accepts_a_value_of_its_type():
-    assert resolve(spec("method", seed=7), SOLVERS).seed == 7
-
-
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
         (spec("metod"), "unknown solver 'metod'; did you mean 'method'? known: "),
-        (spec("other:scs"), "unknown solver 'other:scs'; "),
         (spec("generic"), "unknown solver 'generic'; did you mean 'generic:*'? "),
         (
             spec("generic:dapq"),
             "unknown backend of generic 'dapq'; did you mean 'daqp'? known: daqp, scs",
         ),
         (spec("open:*"), "open:* names no backend; write open:NAME"),
-        (spec("open:"), "open: names no backend; write open:NAME"),
         (
             spec("method", max_itr=9),
             "method: unknown option 'max_itr'; did you mean 'max_iter'? known: ",
         ),
         (spec("generic:scs", backend="daqp"), "generic:scs: unknown option 'backend'"),
-        (
-            spec("method", max_iter=9.0),
-            "method: max_iter = 9.0 is of type float; expected int",
-        ),
-        (
-            spec("method", max_iter=True),
-            "method: max_iter = True is of type bool; expected int",
-        ),
-        (
-            spec("method", alpha=True),
-            "method: alpha = True is of type bool; expected float",
-        ),
-        (
-            spec("method", scaling=1),
-            "method: scaling = 1 is of type int; expected bool",
-        ),
-        (spec("method", mode=1), "method: mode = 1 is of type int; expected str"),
         (spec("method", max_iter=0), "method: max_iter must be positive, got less"),
     ],
 )
@@ -139,11 +110,6 @@ def test_an_invalid_solver_is_reported_in_one_line(asked, message):
 
     assert str(e.value).startswith(message)
     assert "\n" not in str(e.value)
-
-
-def test_the_error_for_an_unknown_solver_mentions_plugins():
-    with pytest.raises(InputError, match=r"known: .*; others come with --plugin FILE"):
-        resolve(spec("mine"), SOLVERS)
 
 
 def test_options_are_all_fields_with_their_values():
@@ -214,8 +180,6 @@ def family(key="n: int = 1", forms="('p',)", made="Mine()"):
             "import nothing_of_that_name",
             "failed to import: ModuleNotFoundError: No mod",
         ),
-        ("raise RuntimeError('two\\nlines')", "failed to import: RuntimeError: two li"),
-        ("def", "failed to import: SyntaxError: "),
         ("raise SystemExit(3)", "failed to import: SystemExit: 3"),
         ("solvers = {}", "defines neither SOLVERS nor PROBLEMS"),
         ("SOLVERS = [1]", "SOLVERS is of type list; expected dict"),
@@ -233,15 +197,12 @@ def family(key="n: int = 1", forms="('p',)", made="Mine()"):
             family("n: int | str = 1"),
             "failed to import: InputError: key n is annotated",
         ),
-        (family("n: bool = True"), "failed to import: InputError: key n is annotated"),
         (
             family("n: int", made="Mine(1)"),
             "failed to import: InputError: key n has no default; ",
         ),
         (family(made="Mine(2)"), "PROBLEMS['a']: n = 2; expected the default of the"),
         (family(forms="'dual'"), "PROBLEMS['a']: forms = 'dual'; expected a tuple of"),
-        (family(forms="()"), "PROBLEMS['a']: forms = (); expected a tuple of strings"),
-        (family(forms="(1,)"), "PROBLEMS['a']: forms = (1,); expected a tuple of st"),
     ],
 )
 def test_an_invalid_plugin_is_reported_in_one_line(tmp_path, text, message):
@@ -315,12 +276,6 @@ def test_entry_points_are_imported_when_their_names_are_used(install, metadata):
 def test_an_entry_that_is_not_a_solver_is_named(place, message):
     with pytest.raises(InputError, match=message):
         Registry({"mine": place}, check_solver)["mine"]
-
-
-def test_entry_points_of_other_groups_are_not_solvers(install):
-    install("its-1.0.dist-info", "[console_scripts]\nmortarbench = no_such_module:X\n")
-
-    assert entry_points_of("mortarbench.solvers") == {}
 
 
 def test_a_name_that_exists_cannot_be_taken_by_a_plugin():
@@ -514,16 +469,6 @@ def test_a_value_of_another_type_than_annotated_is_refused(options, message):
         resolve(spec("wide", **options), {"wide": Wide()})
 
     assert str(refused.value) == f"wide: {message}"
-
-
-@pytest.mark.parametrize(
-    ("options", "value"),
-    [({"steps": 9}, 9), ({"norm": 2}, 2), ({"weight": None}, None), ({"weight": 3}, 3)],
-)
-def test_a_value_of_an_annotated_type_is_taken(options, value):
-    (name,) = options
-
-    assert getattr(resolve(spec("wide", **options), {"wide": Wide()}), name) == value
 
 
 def test_defaults_determine_types_if_annotations_cannot_be_read():

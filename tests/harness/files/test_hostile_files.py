@@ -10,19 +10,17 @@ import subprocess
 import sys
 import zipfile
 import zlib
-from itertools import product
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat
-from scipy.sparse import csc_array, csc_matrix
+from scipy.sparse import csc_matrix
 
 from mortarbench.cli.main import main
 from mortarbench.harness import QP, InputError, no_rows
 from mortarbench.harness.files.datafile import MIB, VARIABLE, check_size
-from mortarbench.harness.files.parquetfile import save_parquet
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.problems import PROBLEMS
@@ -340,12 +338,7 @@ def text(value):
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        declared("P is not symmetric", {"P_data": np.ones(7),
-            "P_indices": np.array([0, 1, 2, 3, 4, 5, 0]),
-            "P_indptr": np.array([0, 1, 2, 3, 4, 5, 7])}),
         declared("A is not a matrix", {"A_indices": np.array([N])}),
-        declared("A is not a matrix", {"A_indices": np.array([-1])}),
-        declared("A is not a matrix", {"A_shape": np.array([-1, 6])}),
         declared("A is not a matrix", {"A_shape": np.array([1, N])}),
         declared("b has 1 entries; expected 1099511627776", {
             "A_shape": np.array([2**40, 6])}),
@@ -355,17 +348,11 @@ def text(value):
         declared("must contain integers", {"A_indices": np.array([0.5])}),
         declared("q is of type", {"q": np.array(["1"] * 6)}),
         declared("q is of type", {"q": np.ones(6, dtype=complex)}),
-        declared(r"q\[0\] is inf; expected", {"q": np.full(6, np.longdouble("1e400"))}),
-        declared(r"lb\[0\] is nan; expected a number", {"lb": np.full(6, np.nan)}),
-        declared(r"h has shape \(2, 2\)", {"h": np.ones((2, 2))}),
-        declared("meta is not a string", {"meta": np.array([1, 2])}),
         declared("meta is not a JSON object", {"meta": text([])}),
         declared("nested too deeply", {"meta": text('{"a": ' + "[" * 10**5)}),
         declared("constant is not a finite", {"meta": text({"scale": 10**400})}),
         declared("constant is not a finite", {"meta": text('{"scale": NaN}')}),
-        declared("constant is not a finite", {"meta": text({"scale": True})}),
         declared("Exceeds the limit", {"meta": text('{"scale": 1' + "0" * 5000 + "}")}),
-        declared("dense is not a list", {"meta": text({"dense": 3})}),
         declared("dense is not a list", {"meta": text({"dense": [["P"]]})}),
         declared("A, dense and 1099511627776 × 6, would take", {
             "A_shape": np.array([2**40, 6]), "meta": text({"dense": ["A"]})}),
@@ -379,39 +366,10 @@ def test_numbers_that_define_no_qp_are_named(tmp_path, cheaply, write, message):
     assert len(str(caught.value)) < 500
 
 
-UNSYMMETRIC = np.array([[1.0, 0.5], [0.0, 1.0]])
 TWO = {
     "q": np.ones(2), "G": csc_matrix((0, 2)), "h": np.zeros(0), "A": csc_matrix((0, 2)),
     "b": np.zeros(0), "lb": np.zeros(2), "ub": np.ones(2),
 }  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("suffix", "dense"),
-    [
-        *product(["npz", "mat"], [True, False]), ("parquet", False),
-        pytest.param("parquet", True, marks=pytest.mark.slow),
-    ],
-)  # fmt: skip
-def test_a_p_that_is_not_symmetric_is_refused_in_every_format(tmp_path, suffix, dense):
-    """P[0, 1] and P[1, 0] differ by a half, as in the expected message."""
-    path = tmp_path / f"a.{suffix}"
-    P = UNSYMMETRIC if dense else csc_array(UNSYMMETRIC)
-    qp = QP(**{k: no_rows(2) if k in "GA" else v for k, v in TWO.items()}, P=P)
-    if suffix == "npz":
-        save_qp(path, qp, {})
-    elif suffix == "parquet":
-        save_parquet(path, qp, {})
-    else:
-        meta = json.dumps({"dense": ["P"] if dense else []})
-        savemat(path, {**TWO, "P": csc_matrix(UNSYMMETRIC), "meta": meta})
-
-    with pytest.raises(
-        InputError,
-        match=r"P is not symmetric: P\[\d, \d\] and .* differ by 0\.5; P is upper "
-        r"triangular: expected both triangles, P \+ P\.T",
-    ):
-        build(path)
 
 
 def test_entries_in_any_order_are_added_up(tmp_path):

@@ -118,32 +118,15 @@ def columns(**changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        pytest.param(
-            {"P": [1.0, 2.0], "q": [1.0, 1.0]},
-            r"P has shape \(1, 2\); expected \(2,",
-            marks=pytest.mark.slow,
-        ),
         (
             {"P": [1.0] * 3, "q": [1.0, 1.0]},
             "P has 3 entries; expected rows of 2 entries",
         ),
-        pytest.param({"P": [np.nan]}, r"P\[0, 0\] is nan", marks=pytest.mark.slow),
         pytest.param(
             {"P": ["one"]}, "P is not a list of numbers", marks=pytest.mark.slow
         ),
         ({"q": None}, "P or q is null"),
-        pytest.param(
-            {"b": [3.0]},
-            "A is missing, but b is present",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"lb": [2.0], "ub": [1.0]},
-            "bounds cross at 0: 2 > 1",
-            marks=pytest.mark.slow,
-        ),
         ({"ub": "left out"}, "no column ub"),
-        pytest.param({"P": 3.0}, "P is not a list of numbers", marks=pytest.mark.slow),
     ],
 )
 def test_a_file_without_a_problem_is_refused_in_one_line(path, changes, message):

@@ -93,21 +93,10 @@ def test_a_file_name_is_taken_as_it_is(tmp_path):
         ({"h": None, "G_indptr": None}, "G_indptr missing, but G_data is present"),
         ({"meta": np.array("[1]")}, "meta is not a JSON object"),
         ({"meta": np.array("{")}, "Expecting property name"),
-        ({"q": np.zeros(2)}, r"P has shape \(3, 3\); expected \(2, 2\)"),
-        ({"q": np.array(["a", "b", "c"])}, "q is of type <U1; expected numbers"),
-        (
-            {"q": np.array([1.0, np.nan, 0.0])},
-            r"q\[1\] is nan; expected a finite number",
-        ),
-        ({"lb": np.full(3, 2.0)}, "bounds cross"),
         ({"P_indices": np.array([0, 1, 0, 7])}, "P is not a matrix in CSC parts"),
         ({"P_indices": np.array([0.0, 1, 0, 1])}, "must contain integers"),
         ({"P_indptr": np.array([0, 2])}, "P is not a matrix in CSC parts"),
         ({"P_shape": np.array([3])}, "P is not a matrix in CSC parts"),
-        (
-            {"P_data": np.array([2.0, np.nan, 1, 3])},
-            r"P\[1, 0\] is nan; expected a finite number",
-        ),
     ],
 )
 def test_a_malformed_file_is_named_with_the_error(saved, changes, complaint):
@@ -209,24 +198,14 @@ def test_a_sparse_matrix_may_be_passed_as_its_arrays(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"P": None}, "P is missing"),
-        ({"q": None}, "q is missing"),
         ({"h": None}, "h is missing, but G is present"),
-        ({"A": None}, "A is missing, but b is present"),
         ({"Aeq": np.eye(2)}, "unknown array 'Aeq'; known: A, G, P, b, h, lb, q, ub"),
         (
             {"P": None, "P_data": np.ones(1)},
             "P_indices, P_indptr, P_shape missing, but",
         ),
-        ({"P": np.eye(3)}, "P has shape (3, 3); expected (2, 2)"),
         ({"P": np.ones(4)}, "P has shape (4,); expected two dimensions"),
-        ({"P": np.array([[1.0, 2.0], [0.0, 1.0]])}, "P is not symmetric: P["),
-        (
-            {"G": np.array([[np.nan, 1.0]])},
-            "G[0, 0] is nan; expected a finite number",
-        ),
         ({"h": np.array(["4"])}, "h is of type <U1; expected numbers"),
-        ({"lb": [2.0, 0.0]}, "bounds cross at 0: 2 > 1"),
     ],
 )
 def test_plain_arrays_that_do_not_define_a_qp_are_refused(tmp_path, changes, complaint):

@@ -250,11 +250,6 @@ def test_measurements_beside_misbehaving_solvers_are_kept_and_undisturbed(
     check_neighbours(tmp_path, watched, careless)
 
 
-@pytest.mark.slow
-def test_measurements_beside_all_misbehaving_solvers_are_undisturbed(tmp_path, watched):
-    check_neighbours(tmp_path, watched, OUTCOMES)
-
-
 def test_sleeping_threads_may_stay_and_busy_threads_may_not(bench):
     bench("pools")
     pool = bench.process("pools")

@@ -39,13 +39,6 @@ def test_a_case_is_built_once_and_reused(get):
     assert len(get.made) == 1
 
 
-def test_different_params_or_code_are_stored_as_different_cases(get):
-    entries = [get(name(n=1)), get(name(n=2)), get(name(n=1), environment="there")]
-
-    assert len(get.made) == 3
-    assert len({e.qp for e in entries}) == 1
-
-
 def test_one_of_many_concurrent_callers_builds(get):
     # file locks belong to open files, so threads compete for them like processes
     with ThreadPoolExecutor(8) as pool:

@@ -118,7 +118,6 @@ def test_a_rank_that_exits_with_0_before_the_others_is_named(measured, stage, ra
     assert names_stage(record.message, stage)
 
 
-@pytest.mark.slow  # `test_first_rank.py` tests interleaved output without a solve
 def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured):
     record = measured("product", "prints")
 

@@ -27,12 +27,10 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
 from mortarbench.harness.suite.suite import Suite
-from mortarbench.reports.answer import rows
 from mortarbench.reports.measurements import read_measurements
 from tests.support import ADVERSARIES
 
 PLUGIN = ADVERSARIES
-SIZES = (10, 20, 40, 80)
 START = [sys.executable, "-P", str(PLUGIN)]
 SOLVERS = load_plugin(PLUGIN).solvers
 FAMILIES = load_plugin(PLUGIN).problems
@@ -316,50 +314,6 @@ def test_answers_of_a_sweep_are_verified_at_one_accuracy(measure, tmp_path):
     }  # fmt: skip
 
 
-@pytest.mark.slow  # the solver sleeps
-def test_the_exponent_of_a_solver_that_sleeps_by_a_power_law_is_found(
-    measure, tmp_path
-):
-    sizes = [assemble("sized", FAMILIES["sized"], {"n": n}, "plain") for n in SIZES]
-    measure(replace(suite("sleepsbypower", repeats=5), cases=tuple(sizes)))
-    ((entry,),) = (row.entries for row in rows(read_measurements(tmp_path)))
-    law = entry.growth.exponent
-
-    assert entry.met == len(SIZES)
-    assert law.low <= 1.5 <= law.high
-    assert law.high - law.low < 0.1
-
-
-def test_a_damaged_case_on_disk_is_built_again(measure, tmp_path):
-    measure(suite("honest"))
-    (built,) = (tmp_path / "cases").glob("*.npz")
-    whole = built.read_bytes()
-    built.write_bytes(whole[:-3] + b"bad")
-    measure(suite("honest", repeats=2))
-
-    assert [r.status for r in read_journal(tmp_path)] == [Verdict.VERIFIED] * 2
-    assert built.read_bytes() == whole
-
-
-def test_a_case_is_built_once_however_often_it_is_measured(measure, tmp_path):
-    measure(suite("honest"))
-    (built,) = (tmp_path / "cases").glob("*.npz")
-    before = built.stat().st_mtime_ns
-    measure(suite("honest", "warm", repeats=3))
-
-    assert built.stat().st_mtime_ns == before
-
-
-def test_a_multiplier_of_the_wrong_sign_is_wrong(measure, tmp_path):
-    measure(suite("honest", cases=[{"h": 3.0}]))
-    (r,) = read_journal(tmp_path)
-
-    assert (r.status, r.claimed) == (Verdict.WRONG, "solved")
-    assert r.primal == r.complementarity == r.gap == 0 < r.dual
-    assert r.vectors is not None
-    assert r.fields is None
-
-
 def test_a_point_with_nan_has_neither_quantities_nor_vectors(measure, tmp_path):
     measure(suite("returnsnan"))
     (r,) = read_journal(tmp_path)
@@ -385,51 +339,6 @@ def test_a_refusal_is_recorded_once_per_tolerance(measure, tmp_path):
     assert [(r.tol, r.repeat) for r in refusals] == [(1e-4, 0), (1e-6, 0)]
     assert (watched.total, len(watched.records), watched.skipped) == (8, 6, 2)
     assert measure(two).records == []
-
-
-def test_a_block_has_every_solver_once_in_an_order_that_changes(measure, tmp_path):
-    names = ("honest", "warm", "zero", "mutatesbyforce")
-    measure(suite(*names, repeats=6))
-    records = read_journal(tmp_path)
-    blocks = [[r for r in records if r.block == i] for i in range(6)]
-
-    assert all(sorted(r.solver for r in block) == sorted(names) for block in blocks)
-    assert all(len({r.repeat for r in block}) == 1 for block in blocks)
-    orders = [[r.solver for r in block] for block in blocks]
-    assert orders[1::2] == [order[::-1] for order in orders[::2]]
-    assert orders[0] != orders[2] or orders[0] != orders[4]
-    assert [r.block for r in records] == sorted(r.block for r in records)
-
-
-def test_the_schedule_is_the_same_every_time(measure, tmp_path):
-    twice = suite("honest", "warm", "zero", repeats=3)
-    orders = []
-    for _ in range(2):
-        measure(twice, fresh=True)
-        orders.append([r.run_id for r in read_journal(tmp_path)])
-
-    assert orders[0] == orders[1]
-
-
-def test_run_ids_are_distinct_for_distinct_cells_and_equal_for_equal_ones(
-    measure, tmp_path
-):
-    cells = suite(
-        "honest", cases=[{}, {"h": 0.5}], tolerances=(1e-4, 1e-6), repeats=2,
-        solvers=(
-            SolverSpec(name="honest", label="a"),
-            SolverSpec(name="honest", label="b"),
-            SolverSpec(name="honest", label="c", options={"level": 5}),
-        ),
-    )  # fmt: skip
-    measure(cells)
-    first = {r.run_id for r in read_journal(tmp_path)}
-    renamed = suite("honest", solvers=(replace(cells.solvers[2], options={}),))
-    measure(renamed, fresh=True)
-    (other,) = read_journal(tmp_path)
-
-    assert len(first) == 2 * 2 * 2 * 3
-    assert other.run_id not in first  # different options, same label
 
 
 @pytest.mark.parametrize("cut", [1, pytest.param(50, marks=pytest.mark.slow), 3000])
@@ -570,14 +479,6 @@ def test_another_environment_is_refused_with_the_differences(measure):
     assert expected in str(e.value)
 
 
-def test_a_comment_does_not_change_a_suite(measure, tmp_path):
-    measure(suite("honest"))
-    commented = suite("honest", text='name = "test"  # for tests\n')
-
-    assert measure(commented).records == []
-    assert (tmp_path / "suite.toml").read_text() == commented.text
-
-
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(
     "name", ["journal/a.txt", "vectors/a.npz", "report/a.html", "suite.toml"]
@@ -620,13 +521,6 @@ def test_scratch_files_lie_in_the_folder_while_a_run_lasts(
     assert {"point.npz", "worker-0.log"} <= {file.name for file in files}
     assert old not in files
     assert not old.parent.exists()
-
-
-def test_an_interrupted_run_leaves_no_scratch(measure, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        measure(suite("honest", repeats=2), interrupt_after=1)
-
-    assert not (tmp_path / ".scratch").exists()
 
 
 def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
@@ -777,20 +671,6 @@ def faults(monkeypatch):
     return faults
 
 
-def test_a_measurement_prevented_by_a_fault_is_retried_at_once(
-    measure, tmp_path, faults
-):
-    tries = []
-    faults(lambda record: tries.append(record.run_id) or len(tries) == 2)
-    watched = measure(suite("honest", "zero"))
-
-    once_each(tmp_path, 2)
-    assert len(tries) == 3
-    assert tries[1] == tries[2] != tries[0]
-    assert watched.faults == []
-    assert len(watched.records) == 2
-
-
 def test_a_measurement_prevented_twice_is_retried_by_the_next_run(
     measure, tmp_path, faults
 ):
@@ -866,20 +746,3 @@ def test_measured_steps_of_a_sequence_prevented_by_faults_are_kept(
     faults(lambda record: False)
     measure(three_steps("chains"))
     assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
-
-
-def test_unfinished_files_of_a_killed_run_are_removed_by_the_next(measure, tmp_path):
-    measure(suite("honest"))
-    stale = [
-        tmp_path / name
-        for name in (
-            ".mortarbench-0.tmp", "cases/0.new", "report/.mortarbench-0.tmp",
-        )
-    ]  # fmt: skip
-    (tmp_path / "report").mkdir()
-    for path in (*stale, tmp_path / "my.tmp"):
-        path.touch()
-    measure(suite("honest"))
-
-    assert not any(path.exists() for path in stale)
-    assert (tmp_path / "my.tmp").exists()

@@ -116,16 +116,6 @@ def test_a_case_that_cannot_be_built_is_omitted_from_later_blocks():
     assert [b.cases for b in blocks] == 3 * [("f/n=2/p",)]
 
 
-def test_each_block_is_announced_before_it_starts():
-    schedule = schedule_of(repeats=2)
-    list(schedule.blocks())
-
-    assert schedule.progress.said == [
-        "f/p, tol 1e-06, repeat 1",
-        "f/p, tol 1e-06, repeat 2",
-    ]
-
-
 def test_the_paired_interval_has_its_nominal_coverage():
     rng = np.random.default_rng(314159)
     hits = 0

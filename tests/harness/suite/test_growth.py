@@ -33,8 +33,6 @@ def test_an_extended_suite_counts_as_the_same_suite(more):
     [
         ({"name": "t"}, "name was 's', now 't'"),
         ({"time_limit": 5}, "time_limit was 60, now 5"),
-        ({"memory_limit": 100}, "memory_limit was 4096, now 100"),
-        ({"accuracy": 1e-6}, "accuracy was not set, now 1e-06"),
         ({"repeats": 2}, "repeats was 3, now 2; it may only grow"),
         ({"tolerances": [1e-8]}, "tolerance 1e-06 is missing; tolerances may be added"),
         ({"solvers": ["a"]}, "solver 'b-50' is missing; solvers may be added"),

@@ -12,9 +12,9 @@ from mortarbench.harness import InputError
 from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.suite.solver_options import (
     listed_options,
-    options_for,
     parse_options,
     sweep,
+    typed,
 )
 
 
@@ -46,6 +46,12 @@ class Plain:
     declines, prepare = Method.declines, Method.prepare
 
 
+def typed_options(name, text, registry):
+    """Return the options of a solver from one text KEY=VALUE."""
+    options = {key: value for key, (value,) in parse_options([text]).items()}
+    return typed(SolverSpec(name=name, label=name, options=options), registry).options
+
+
 SOLVERS = {"method": Method(), "plain": Plain()}
 SPECS = tuple(SolverSpec(name=name, label=name) for name in SOLVERS)
 
@@ -65,7 +71,7 @@ SPECS = tuple(SolverSpec(name=name, label=name) for name in SOLVERS)
     ],
 )
 def test_a_value_is_read_as_the_type_of_its_field(text, value):
-    ((_, found),) = options_for("method", [text], SOLVERS).items()
+    ((_, found),) = typed_options("method", text, SOLVERS).items()
 
     assert found == value
     assert type(found) is type(value)
@@ -99,7 +105,7 @@ def test_a_value_is_read_as_the_type_of_its_field(text, value):
 )
 def test_unknown_options_and_values_are_refused(text, message):
     with pytest.raises(InputError) as e:
-        options_for("method", [text], SOLVERS)
+        typed_options("method", text, SOLVERS)
 
     assert str(e.value).startswith(message)
 
@@ -196,7 +202,7 @@ class Sized:
 def test_an_integer_default_does_not_narrow_a_float(solver, text, value):
     registry = {"sized": solver}
     specs = [SolverSpec(name="sized", label="sized")]
-    one = options_for("sized", [f"rho={text}"], registry)
+    one = typed_options("sized", f"rho={text}", registry)
     (spec,) = sweep(specs, {"rho": [text]}, registry)
 
     assert one == {"rho": value}
@@ -204,6 +210,6 @@ def test_an_integer_default_does_not_narrow_a_float(solver, text, value):
 
 
 def test_the_default_determines_the_type_if_the_annotation_does_not():
-    assert options_for("sized", ["start=3"], {"sized": Sized()}) == {"start": 3}
+    assert typed_options("sized", "start=3", {"sized": Sized()}) == {"start": 3}
     with pytest.raises(InputError, match=r"start = '0\.5'; expected an integer"):
-        options_for("sized", ["start=0.5"], {"sized": Sized()})
+        typed_options("sized", "start=0.5", {"sized": Sized()})

@@ -4,7 +4,6 @@ Components of planted solutions are integers times powers of two; on discs and c
 they form Pythagorean pairs. Therefore f* and all errors are known in fractions.
 """
 
-import json
 from dataclasses import replace
 from fractions import Fraction
 
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from mortarbench.cli.main import main
 from mortarbench.harness import QP, Cones, Discs, Solution, Status
 from mortarbench.harness.conformance.metamorphic import (
     change_units,
@@ -20,9 +18,8 @@ from mortarbench.harness.conformance.metamorphic import (
     permute_unknowns,
     shift_unknowns,
 )
-from mortarbench.harness.verify.kkt import allowed, kkt_residuals, normality
+from mortarbench.harness.verify.kkt import allowed, kkt_residuals
 from mortarbench.harness.verify.multipliers import with_multipliers
-from mortarbench.registries import Registries
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.rational import rational
 
@@ -413,59 +410,6 @@ def test_a_tiny_disc_is_judged_relative_to_its_neighbour(length, accepted):
     assert (found.verdict is mb.Verdict.VERIFIED) == accepted
 
 
-@pytest.mark.parametrize("trap", ["", *TRAPS])
-def test_additional_measures_vanish_at_solutions_and_are_of_first_order(trap):
-    for seed in range(10):
-        planted = ExactProblem({trap}, seed)
-        qp, s = planted.qp, planted.solution
-        at = normality(qp, s, 1e-8)
-        assert (
-            at.natural_map <= 1e-9 if trap == "cancelled" else at.natural_map <= 1e-12
-        )
-        assert at.normal_distance <= 1e-14
-        discs = qp.sets[1]
-        if trap or not isinstance(discs, Discs):
-            continue
-        for block in discs.index:
-            if s.z_box[block].any():
-                x = s.x.copy()
-                c, t = np.cos(1e-4), np.sin(1e-4)
-                x[block] = np.array([[c, -t], [t, c]]) @ x[block]
-                off = normality(qp, replace(s, x=x), 1e-8)
-                ratio = np.linalg.norm(s.z_box[block])
-                force = max(abs(v).max() for v in (qp.P @ x, qp.q))
-                assert off.normal_distance <= 1.01e-4 * ratio / force + 1e-15
-                assert off.normal_distance >= 0.9e-4 * ratio / force
-                assert off.natural_map >= 1e-7
-
-
-def test_distances_to_normal_cones_are_euclidean():
-    cones = Cones([[0, 1, 2]], [0.75])
-    slip, inside, apex = np.array([[4.0, 3, 0], [8, 3, 0], [0, 0, 0]])
-    for x, z, distance in [
-        (slip, [-3, 4, 0], 0),  # −z_N = ¾‖z_T‖
-        (slip, [3, -4, 0], 5),  # the wrong sign
-        (slip, [-3, 4, 2], 2),  # the wrong direction
-        (slip, [4, 3, 0], 5),
-        (inside, [-3, 4, 0], 5),
-        (apex, [-3, 4, 0], 0),
-        (apex, [-9, 4, 0], 0),
-        (apex, [4, 3, 0], 5),
-        (apex, [1, 0, 0], 1),
-    ]:
-        # together with a longer block, which defines the scale of the apex
-        both = Cones([[0, 1, 2], [3, 4, 5]], [0.75, 1])
-        x, z = np.append(x, [9, 0, 0]), np.append(np.array(z, float), [0, 0, 0])
-        assert both.normal_distances(x, z, 1e-9)[0] == pytest.approx(distance)
-    assert cones.normal_distances(0 * slip, slip, 1e-9) == pytest.approx([5])
-    flat = Cones([[0, 1, 2]], [0.0])
-    assert flat.normal_distances(np.array([1.0, 0, 0]), slip, 1e-9) == [4]
-    discs = Discs([[0, 1], [2, 3], [4, 5]], [1.0, 0.0, 1.0])
-    x = np.array([0.6, 0.8, 0, 0, 0.1, 0])
-    z = np.array([-0.8, 0.6, 7, 8, 0, 2])
-    assert discs.normal_distances(x, z, 1e-9) == pytest.approx([1, 0, 2])
-
-
 @pytest.mark.parametrize(
     "trap",
     ["", "steep", "apex", "point", *(
@@ -481,25 +425,6 @@ def test_multipliers_are_computed_for_points(trap):
         worst.append(kkt_residuals(planted.qp, s).worst)
     assert np.median(worst) <= 1e-11
     assert np.quantile(worst, 0.8) <= 1e-7
-
-
-def test_verify_and_solve_report_the_additional_measures(tmp_path, capsys):
-    planted = ExactProblem(set(), 5)
-    found = mb.verify(planted.qp, planted.solution.x)
-    assert found.verdict is mb.Verdict.VERIFIED
-    assert found.normality.natural_map <= 1e-11
-    assert mb.verify("contact-patch/dual", np.zeros(19)).normality is None
-
-    discs = mb.QP.from_arrays(np.eye(2), [-3, -4], sets=[Discs([[0, 1]], [1])])
-    path = mb.export(discs, tmp_path / "qp.npz")
-    assert (
-        main(Registries(), ["solve", f"file:{path}", "--solver", "clarabel", "--json"])
-        == 0
-    )
-    record = json.loads(capsys.readouterr().out)
-    assert 0 <= record["natural_map"] <= 1e-6
-    assert 0 <= record["normal_distance"] <= 1e-6
-    assert record["sizes"]["discs"] == 1
 
 
 def test_multipliers_are_computed_at_the_apex_of_all_cones():
@@ -535,9 +460,6 @@ def test_equivalent_formulations_have_the_same_residuals(trap):
         assert here.x == pytest.approx(s.x, abs=1e-9 * np.abs(s.x).max())
         before, after = kkt_residuals(qp, here), kkt_residuals(new.qp, there)
         assert after == pytest.approx(before, rel=1e-6, abs=1e-14)
-        assert normality(qp, here, 1e-8).normal_distance == pytest.approx(
-            normality(new.qp, there, 1e-8).normal_distance, rel=1e-3, abs=1e-12
-        )
 
 
 def test_a_reversed_or_shifted_cone_is_refused():
