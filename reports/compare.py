@@ -59,6 +59,7 @@ class Change:
     before: str  #: label before
     after: str  #: label after
     ratio: Interval | None  #: time after relative to before; None without common cells
+    other_machine: bool  #: True if common cells have times, but of other machines
     cells: int  #: number of cells with a ratio
     repeats: float  #: mean number of repeats of these cells
     by_cell: pd.DataFrame  #: ratio of each cell, from the largest
@@ -82,6 +83,8 @@ class Change:
 
     def sentence(self, limit: float) -> str:
         """Return the judgement with its numbers in one line."""
+        if self.other_machine:
+            return f"cannot tell: {self.name} was measured on another machine"
         if self.ratio is None:
             return f"cannot tell: {self.name} has no cell that was verified both times"
         measured = f"{number(self.ratio.value)} × {interval(self.ratio, 3)}".strip()
@@ -133,17 +136,18 @@ def _change(
             "turn": statuses.severity_new - statuses.severity_old,
         }
     )
-    x, y = (_logs(run, label) for run, label in ((before, old), (after, new)))
+    verified = both[both.verified_old & both.verified_new]
+    cells = set(verified[CELL].itertuples(index=False, name=None))
+    machines = _machines(before, after)
+    x, y = _logs(before, old, machines), _logs(after, new, machines)
     ratios = {
         key: _ratio(x[key], y[key], paired=paired)
-        for key in both[both.verified_old & both.verified_new][CELL].itertuples(
-            index=False, name=None
-        )
-        if key in x and key in y
+        for key in x
+        if key in y and key[1:] in cells
     }
     mean = mean_ratio(list(ratios.values()))
     by_cell = pd.DataFrame(
-        [(*key, np.exp(r.mean), r.repeats) for key, r in ratios.items()],
+        [(*key, np.exp(r.mean), r.repeats) for (_, *key), r in ratios.items()],
         columns=[*CELL, "ratio", "repeats"],
     ).sort_values("ratio", ascending=False, ignore_index=True)
     return Change(
@@ -152,6 +156,7 @@ def _change(
         ratio=mean,
         cells=len(ratios),
         repeats=float(by_cell.repeats.mean()) if ratios else 0.0,
+        other_machine=bool(cells) and not ratios,
         by_cell=by_cell,
         statuses=statuses,
     )
@@ -166,14 +171,28 @@ class CellRatio(NamedTuple):
     repeats: float
 
 
-def _logs(run: Measurements, label: str) -> dict[tuple[Any, ...], pd.Series]:
+def _machines(before: Measurements, after: Measurements) -> dict[str, str]:
+    """Map the environments of `after` to those of `before` on the same machine."""
+    known = {digest: digest for digest in before.df.environment}
+    for digest, one in after.environments.items():
+        for other, earlier in before.environments.items():
+            if one and one.get("machine") == earlier.get("machine"):
+                known.setdefault(digest, other)
+    return known
+
+
+def _logs(
+    run: Measurements, label: str, machines: dict[str, str]
+) -> dict[tuple[Any, ...], pd.Series]:
+    """Return log times by machine and cell, indexed by session and repeat."""
     df = run.df[(run.df.solver == label) & (run.df.total_seconds > 0)]
+    df = df.assign(machine=df.environment.map(machines))
     return {
         key: pd.Series(
             np.log(of.total_seconds.to_numpy()),
             index=pd.MultiIndex.from_frame(of[["session", "repeat"]]),
         )
-        for key, of in df.groupby(CELL, sort=False)
+        for key, of in df.groupby(["machine", *CELL], sort=False)
     }
 
 

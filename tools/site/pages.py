@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mortarbench.reports.render.formulas import mathml
+from math_core import LatexError, LatexToMathML
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -111,9 +111,18 @@ def typeset(content: str) -> str:
     if swallowed := SWALLOWED.search(content):
         raise ValueError(f"emphasis within a word: {swallowed[0]}")
 
+    converter = LatexToMathML()
+
     def converted(formula: re.Match[str]) -> str:
         tag, tex = formula[1], html.unescape(formula[2]).strip()
-        return f'<{tag} class="formula">{mathml(tex, display=tag == "div")}</{tag}>'
+        display = tag == "div"
+        if display and r"\tag{" in tex and r"\begin{" not in tex:
+            tex = rf"\begin{{equation}}{tex}\end{{equation}}"
+        try:
+            mathml = converter.convert_with_local_state(tex, displaystyle=display)
+        except LatexError as e:
+            raise ValueError(f"formula {tex}: {e}") from None
+        return f'<{tag} class="formula">{mathml}</{tag}>'
 
     return FORMULA.sub(converted, content)
 
