@@ -65,8 +65,3 @@ def test_products_of_slices_write_only_their_slice():
     assert_allclose(found[1:5], [-2, 7, -12, 7])
     assert_allclose(found[10:], [7, -12, 7, -2])
     assert_array_equal(found[[0, *range(5, 10)]], 99)
-
-
-def test_more_motions_than_a_rigid_body_has_are_refused():
-    with pytest.raises(ValueError, match="7 columns of R; expected at most 6"):
-        projected(csc_array(np.eye(8)), np.eye(8)[:, :7].copy(), [0], np.ones(8))
