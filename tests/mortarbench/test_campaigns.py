@@ -228,19 +228,6 @@ def test_equal_measurements_of_two_machines_are_kept_and_reported_apart(
     assert read_journal(tmp_path / "ab") == records
 
 
-def test_two_sessions_on_one_machine_are_kept_and_pooled(measure, campaign, tmp_path):
-    """The second session measures a part of the first one again."""
-    first = measure("a", depths="1")
-    shutil.copytree(campaign / "before", tmp_path / "b")
-    merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
-    row = read_evidence(tmp_path / "all").outcomes["well/dual", 1e-6]
-
-    assert merged.records[:4] == first.records
-    assert merged.records[4:] == tuple(read_journal(tmp_path / "b"))
-    assert [len(o.records) for o in row.values()] == [4, 4]
-    assert {o.seconds("total").samples for o in row.values()} == {4}
-
-
 def test_a_measurement_of_two_sessions_is_replayed_by_session_and_run_id(
     measure, tmp_path
 ):

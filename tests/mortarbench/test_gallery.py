@@ -152,31 +152,6 @@ def test_the_code_of_your_own_solver(run_code):
 
 
 @pytest.mark.slow
-def test_your_own_solver(execute):
-    """The notebook shows the results of `test_the_code_of_your_own_solver`."""
-    (rate, expected, refuted, grades, code), shown = execute(
-        "own-solver",
-        "float(moves[-1] / moves[-2])",
-        "float(rates['plain'])",
-        "sorted(set(results.df[results.df.status == 'inaccurate'].solver))",
-        "sorted(checks.grade.unique())",
-        "done.returncode",
-    )
-    assert rate == pytest.approx(expected, rel=1e-3)
-    assert refuted == ["momentum", "plain"]
-    assert (grades, code) == (["decline", "pass"], 0)
-    assert shown["image/png"] == 1
-
-
-@pytest.mark.slow
-def test_your_own_steps(execute):
-    """The notebook shows the results of `test_the_code_of_your_own_steps`."""
-    (verdicts,), shown = execute("own-steps", "sorted(set(counts.verdict))")
-    assert verdicts == ["verified"]
-    assert shown["image/png"] == 1
-
-
-@pytest.mark.slow
 def test_your_own_bodies(execute):
     """With mesh refinement, mortar pressures converge to those of Hertz; nodal
     pressures do not.
