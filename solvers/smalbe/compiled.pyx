@@ -50,7 +50,7 @@ from mortarbench.harness.distributed.sparse cimport (
 from sys import getrefcount
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, issparse
+from scipy.sparse import csr_array, issparse
 
 from mortarbench.harness import Status
 from mortarbench.harness.operators import linear_map
