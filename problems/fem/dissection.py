@@ -2,11 +2,11 @@
 
 A set of nodes is bisected at the median of the coordinate along which it is longest, in
 the principal axes of its connected component (recursive coordinate bisection, Berger
-and Bokhari, IEEE Trans. Comput. 36, 1987). The nodes of the second half with a neighbour in the first half form the separator, which is
-eliminated after both halves. The halves are bisected recursively down to LEAF_SIZE
-nodes (George, SIAM J. Numer. Anal. 10, 1973). Selected nodes are eliminated last, so
-that the trailing block of the factor is the Cholesky factor of the Schur complement on
-these nodes.
+and Bokhari, IEEE Trans. Comput. 36, 1987). The nodes of the second half with a
+neighbour in the first half form the separator, which is eliminated after both halves.
+The halves are bisected recursively down to LEAF_SIZE nodes (George, SIAM J. Numer.
+Anal. 10, 1973). Selected nodes are eliminated last, so that the trailing block of the
+factor is the Cholesky factor of the Schur complement on these nodes.
 
 Leaves, separators and the selected nodes of each connected component, each eliminated
 as a whole, are the fronts of a multifrontal factorisation
