@@ -24,7 +24,7 @@ from tests.support.textbook.projected import by_lanczos, projected_problem
 
 pytestmark = pytest.mark.together
 
-PRESETS = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
+PRESETS = ["smalbe"]
 
 
 class Operator:

@@ -59,7 +59,7 @@ def test_friction_takes_fewer_products_than_published_rules(name):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(
     ("solver", "recycle", "steps"),
-    [("smalbe", False, 25), ("smalbe", True, 18), ("smalbe-permon", False, 25)],
+    [("smalbe", False, 25), ("smalbe", True, 18)],
 )
 def test_compiled_steps_and_textbook_steps_are_the_same(
     name, solver, recycle, steps, monkeypatch
@@ -153,10 +153,9 @@ def fixed_point(qp, mu, solve, enough):
     raise AssertionError(f"residual {residual} after 60 problems")
 
 
-@pytest.mark.parametrize("name", ["smalbe", "smalbe-permon"])
-def test_a_warm_fixed_point_takes_about_half_the_products_of_a_cold_one(name):
-    """Each solver follows its own sequence to the same residual of Coulomb's law."""
-    qp, solver, enough = emitted("greco/n=16/dual-bounds"), SOLVERS[name], 1e-7
+def test_a_warm_fixed_point_takes_about_half_the_products_of_a_cold_one():
+    """Both sequences end at the same residual of Coulomb's law."""
+    qp, solver, enough = emitted("greco/n=16/dual-bounds"), SOLVERS["smalbe"], 1e-7
     prepare = solver.chain(TOL)
     warm, left = fixed_point(qp, 1.0, lambda qp: prepare(qp)(), enough)
     cold, _ = fixed_point(qp, 1.0, lambda qp: solver.prepare(qp, TOL)(), enough)

@@ -554,11 +554,11 @@ def test_the_residual_of_the_original_problem_decides(dual, tol, seeds):
     """The residual of the projected problem may be smaller."""
     for seed in seeds:
         qp = dual(seed)
-        for name, most in (("smalbe", tol), ("smalbe-permon", 5 * tol)):
+        for name in ("smalbe", "smalbe-permon"):
             s = SOLVERS[name].prepare(qp, tol)()
 
             assert s.status is Status.SOLVED
-            assert relative_residual(qp, s, tol) <= most * (1 + 1e-9)
+            assert relative_residual(qp, s, tol) <= tol * (1 + 1e-9)
 
 
 def test_multipliers_leave_no_gradient_that_rows_could_take(dual):
@@ -595,7 +595,7 @@ def mixed(P, q, lb, ub, A, b):
     return bounded(P, q, A, b, lb=np.asarray(lb), ub=np.asarray(ub))
 
 
-@pytest.mark.parametrize("name", INHOUSE)
+@pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed", "smalbe-direct"])
 @pytest.mark.parametrize(
     "qp",
     [
