@@ -9,7 +9,10 @@ from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness import QP, Discs, Status
 from mortarbench.harness.conformance.manufactured import unbounded
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.textbook import (
     PERMON,
     Omega,
@@ -18,6 +21,7 @@ from mortarbench.solvers.smalbe.textbook import (
     mprgp,
     power_method,
 )
+from tests.support.discs import qp_on_discs
 
 NAMES = ["smalbe-textbook", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
 
@@ -263,3 +267,56 @@ def test_estimates_of_the_norm(seed):
 def test_wrong_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Textbook(**options)
+
+
+def agreeing_answers(qp, tol=1e-8):
+    """Return the answers of the compiled solver and of the textbook, both solved."""
+    solvers = (SOLVERS["smalbe"], SOLVERS["smalbe-textbook"])
+    fast, slow = (solver.prepare(qp, tol)() for solver in solvers)
+    assert fast.status is slow.status is Status.SOLVED
+    energy = abs(qp.objective(fast.x)) + 0.5 * fast.x @ (qp.P @ fast.x)
+    assert qp.objective(slow.x) == pytest.approx(
+        qp.objective(fast.x), abs=1e-7 * energy
+    )
+    return fast, slow
+
+
+@pytest.mark.parametrize("shape", ["bounds", "box", "some bounds", "equalities"])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_compiled_solver_has_the_answers_of_the_textbook(manufactured, shape, seed):
+    """The minimiser and the multipliers are unique."""
+    qp, _ = manufactured(shape, seed=seed)
+    fast, slow = agreeing_answers(qp)
+
+    for name in ("x", "y", "z_box"):
+        expected = getattr(fast, name)
+        size = np.abs(expected).max(initial=1e-9)
+        assert getattr(slow, name) == pytest.approx(expected, abs=1e-6 * size)
+
+
+@pytest.mark.parametrize("rows", [0, 2])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_compiled_solver_has_the_answers_of_the_textbook_on_discs(seed, rows):
+    qp, x = qp_on_discs(seed + 400, dim=2 + seed % 2, rows=rows)
+    for s in agreeing_answers(qp):
+        assert s.x == pytest.approx(x, abs=1e-5 * np.abs(x).max())
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "beam-ring/Nr=4/Nh=3/step=10/dual",
+        "membranes/S=2/n=4/dual",  # P is an operator, and rows are those of subdomains
+        "greco/n=16/dual",
+        pytest.param("hertz-plane/n=4/feti=16/dual", marks=pytest.mark.slow),
+        pytest.param("contact-patch/dim=3/friction=coulomb/mu=0.2/dual",
+                     marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_contact_forces_agree_with_those_of_the_textbook(case):
+    qp = parse(case, PROBLEMS).build(reference_solution).qp
+    fast, slow = agreeing_answers(qp)
+    bounded = np.isfinite(qp.lb) | np.isfinite(qp.ub)
+    forces = fast.x[bounded]
+
+    assert slow.x[bounded] == pytest.approx(forces, abs=1e-5 * np.abs(forces).max())
