@@ -244,6 +244,45 @@ def test_parts_of_a_gradient_and_feasible_lengths(seed):
     assert np.abs(y - omega.project(y)).max() > 1e-9
 
 
+def test_the_power_method_stops_at_its_tolerance():
+    """For eigenvalues 1 and 1/2, each product reduces the error by a factor of 4, to
+    10⁻⁴ in a few products.
+    """
+    products = []
+
+    def H(v):
+        products.append(v)
+        return v * [1.0, 0.5]
+
+    assert power_method(H, 2) == pytest.approx(1.0, abs=1e-4)
+    assert 5 <= len(products) <= 10
+
+
+def test_a_step_does_not_stop_short_of_a_bound():
+    """A feasible step to 0.3 − 3·0.1 = 5.6e-17 ends exactly at the bound."""
+    omega = Omega(np.zeros(2), np.ones(2))
+    x = omega.step(np.array([0.3, 1.0]), np.array([0.1, 0.0]), 3.0)
+
+    assert x.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("expansion", ["std", "mixed"])
+def test_every_iterate_is_feasible_and_the_cost_never_rises(manufactured, expansion):
+    qp, _ = manufactured("box", seed=271828, dense=True, n=24)
+    omega = Omega(qp.lb, qp.ub)
+    seen = [omega.project(np.zeros(24))]
+    mprgp(
+        qp.P.__matmul__, -qp.q, omega, seen[0], Textbook(expansion=expansion),
+        alpha_bar=1.9 / np.linalg.norm(qp.P, 2), stop=lambda x, gradient: False,
+        max_steps=30, note=lambda letter, x, g: seen.append(x),
+    )  # fmt: skip
+    costs = [qp.objective(x) for x in seen]
+
+    assert len(seen) == 31
+    assert all((omega.project(x) == x).all() for x in seen)
+    assert np.diff(costs).max() <= 1e-13 * abs(costs[0])
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_estimates_of_the_norm(seed):
     """The power method yields a lower bound, Lanczos the norm to a per cent."""
