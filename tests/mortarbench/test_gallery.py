@@ -2,7 +2,7 @@
 
 Slow tests run four notebooks, each in its own kernel in an empty folder, and the code
 of `own-solver` and `stick-and-slip` without a kernel. By default, only the code of
-`own-steps` runs.
+`own-steps` and `textbook` runs.
 """
 
 import json
@@ -131,6 +131,26 @@ def test_the_code_of_your_own_steps(run_code):
     assert products[string, "ssor"] < products[string, "textbook"] / 4
     assert str(found["uphill"].verdict) == "verified"
     assert wasted == counts.expansion[string, "textbook"]
+    found["plt"].close("all")
+
+
+def test_the_code_of_the_textbook(run_code):
+    """The estimate of the norm agrees with the largest eigenvalue, no inner step
+    increases the cost, and all rules lead to the same answer.
+    """
+    found = run_code("textbook")
+    inner, outer, answers = found["inner"], found["outer"], found["answers"]
+
+    assert found["N"] == pytest.approx(found["exact"], rel=1e-3)
+    assert np.linalg.eigvalsh(found["H"])[-1] == pytest.approx(1, rel=1e-3)
+    assert found["run"].steps == "".join(inner.step)
+    assert (np.diff(inner.cost) <= 1e-12).all()
+    assert outer.active.iloc[-1] == (found["answer"].solution.x == found["qp"].lb).sum()
+    for answer in answers.values():
+        assert str(answer.verdict) == "verified"
+        assert answer.solution.x == pytest.approx(
+            found["force"], abs=2e-5 * np.abs(found["force"]).max()
+        )
     found["plt"].close("all")
 
 

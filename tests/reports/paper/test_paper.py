@@ -36,7 +36,8 @@ from mortarbench.reports.paper.report import compose, write_paper
 from mortarbench.reports.paper.timings import PARTS, fit, medians, times
 from mortarbench.reports.render.saving import save_all
 from mortarbench.solvers.reference.solve import reference_solution
-from mortarbench.solvers.smalbe.solver import PAPER, SMALBE
+from mortarbench.solvers.smalbe.solver import SMALBE
+from mortarbench.solvers.smalbe.textbook import PAPER
 
 #: one process runs the module, so that measurements and drawings are made only once
 pytestmark = pytest.mark.together
