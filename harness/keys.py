@@ -18,12 +18,11 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache
-from types import NoneType, UnionType
+from types import NoneType
 from typing import (
     Annotated,
     Any,
     Literal,
-    Union,
     cast,
     get_args,
     get_origin,
@@ -152,8 +151,9 @@ def keys_of(family: type) -> Mapping[str, Key]:
         annotation, *extras = (
             get_args(hint) if get_origin(hint) is Annotated else (hint,)
         )
-        classes = classes_of(annotation) or ()
-        if len(classes) != 1 or classes[0] not in _TYPE_NAMES:
+        choices = get_args(annotation) if get_origin(annotation) is Literal else ()
+        kinds = {type(value) for value in choices} or {annotation}
+        if len(kinds) != 1 or not kinds <= _TYPE_NAMES.keys():
             raise InputError(
                 f"key {field.name} is annotated as {annotation}; expected int, float, "
                 "str or a Literal of one of these types"
@@ -162,29 +162,13 @@ def keys_of(family: type) -> Mapping[str, Key]:
             raise InputError(f"key {field.name} has no default; expected a value")
         keys[field.name] = Key(
             name=field.name,
-            kind=classes[0],
+            kind=kinds.pop(),
             default=cast(Value | None, field.default),
-            choices=get_args(annotation) if get_origin(annotation) is Literal else (),
+            choices=choices,
             range=next((x for x in extras if isinstance(x, Range)), Range()),
             help=next((x for x in extras if isinstance(x, str)), ""),
         )
     return keys
-
-
-def classes_of(annotation: Any) -> tuple[type, ...] | None:
-    """Return the classes that an annotation allows, or None for any class."""
-    if annotation in (Any, None, object):
-        return None
-    if get_origin(annotation) is Literal:
-        return tuple(dict.fromkeys(type(value) for value in get_args(annotation)))
-    if get_origin(annotation) in (Union, UnionType):
-        parts = [classes_of(part) for part in get_args(annotation)]
-        if any(part is None for part in parts):
-            return None
-        return tuple(dict.fromkeys(kind for part in parts for kind in part or ()))
-    kind = get_origin(annotation) or annotation
-    is_class = isinstance(kind, type) and not getattr(kind, "_is_protocol", False)
-    return (kind,) if is_class else None
 
 
 def _number(text: str, kind: type) -> object:

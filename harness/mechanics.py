@@ -781,6 +781,12 @@ def _largest(R: Any) -> Any:
     return columns
 
 
+def in_precision(M: Any, dtype: Any) -> Any:
+    """Return a sparse matrix with entries of another type, and the same indices."""
+    arrays = M.data.astype(dtype, copy=False), M.indices, M.indptr
+    return type(M)(arrays, shape=M.shape)
+
+
 def cancelling(K: csr_array, R: Extended) -> Extended:
     """Return KR (n, r) with about twice the digits of doubles, despite cancellation.
 

@@ -73,7 +73,8 @@ class QP:
 
     Parameters
     ----------
-    P, q, A, b, G, h, structure : see the attributes
+    P, q, structure : see the attributes
+    A, b, G, h : see the attributes; None for no constraints
     lb, ub : (n,) bounds, -inf and inf where absent; None for the bounds of the `Box` in
         `sets`, or for no bounds
     sets : convex sets of blocks of variables; the first may be a `Box` instead of lb
@@ -116,10 +117,10 @@ class QP:
         *,
         P: Matrix,
         q: Vector,
-        A: Matrix,
-        b: Vector,
-        G: Matrix,
-        h: Vector,
+        A: Matrix | None = None,
+        b: Vector | None = None,
+        G: Matrix | None = None,
+        h: Vector | None = None,
         lb: Vector | None = None,
         ub: Vector | None = None,
         sets: Sequence[ConvexSet] = (),
@@ -131,9 +132,11 @@ class QP:
         assert isinstance(box, Box)
         if lb is not None or ub is not None:
             box = Box(box.lower if lb is None else lb, box.upper if ub is None else ub)
-        P, A, G = map(_by_columns, (P, A, G))
+        n = q.size
+        b, h = (np.zeros(0) if v is None else v for v in (b, h))
+        P, A, G = (_by_columns(no_rows(n) if M is None else M) for M in (P, A, G))
         arrays = {"P": P, "q": q, "A": A, "b": b, "G": G, "h": h}
-        n, m, p = q.size, b.size, h.size
+        m, p = b.size, h.size
         shapes = ((n, n), (n,), (m, n), (m,), (p, n), (p,))
         for (name, array), shape in zip(arrays.items(), shapes, strict=True):
             if array.shape != shape:

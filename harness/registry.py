@@ -17,18 +17,29 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType, NoneType
-from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+from types import ModuleType, NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import msgspec
 
 from mortarbench.harness.checked import located
 from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.errors import PLUGINS, InputError, shown, unknown
-from mortarbench.harness.keys import classes_of, keys_of
+from mortarbench.harness.keys import keys_of
 from mortarbench.harness.plugin import Family, Solver
 
 if TYPE_CHECKING:
@@ -37,6 +48,20 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _SOLVER_PARTS = ("declines", "prepare")
+#: types of an option whose default is None and that has no annotation; an integer is
+#: not read as a float, and 1 is not read as true
+_ANY = (int, float, bool, str, NoneType)
+#: types in messages, by the names that Python or msgspec use
+_WORDS = {
+    "int": "an integer",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "a string",
+    "NoneType": "none",
+    "null": "none",
+    "array": "a list",
+    "object": "a table",
+}
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
 
 
@@ -253,21 +278,65 @@ def is_adapter(solver: object) -> bool:
     return hasattr(solver, "library_settings")
 
 
-def option_types(solver: Solver) -> dict[str, Any]:
-    """Return the annotated types of a solver's options by name.
+def option_value(
+    where: str, value: Any, solver: Solver, key: str, *, strict: bool = True
+) -> Any:
+    """Convert a value to the first type of an option that admits it.
 
-    Options annotated as Any or object are omitted. If Python cannot evaluate the
-    annotations, all options are omitted. An omitted option has the type of its default.
+    strict : False to convert texts as well, such as "1e-6" to a number
+
+    Raises
+    ------
+    InputError
+        If no type admits the value.
+
     """
-    try:
+    kinds = option_types(solver, key)
+    if NoneType in kinds and (value is None or (not strict and value == "none")):
+        return None
+    if strict and kinds is _ANY:
+        return value
+    # scalars of NumPy have an empty shape
+    plain = value.item() if getattr(value, "shape", None) == () else value
+    for kind in kinds:
+        # a TypeError is raised for a class of a plug-in
+        with suppress(msgspec.ValidationError, TypeError):
+            return msgspec.convert(plain, kind, strict=strict)
+    names: list[str] = []
+    for kind in kinds:
+        choices = get_args(kind) if get_origin(kind) is Literal else ()
+        names += map(str, choices) if choices else [kind.__name__]
+    raise InputError(f"{where} = {shown(value)}; expected {in_words(names)}")
+
+
+def option_types(solver: Solver, key: str) -> tuple[Any, ...]:
+    """Return the types of the values of an option; None is one if it is the default.
+
+    An option has its annotated type. The type of the default is used if the annotation
+    is missing, Any or object, or if Python cannot evaluate the annotations.
+    """
+    default = known_options(solver, key).get(key)
+    hints: dict[str, Any] = {}
+    # code of a plug-in may raise these exceptions
+    with suppress(NameError, TypeError, AttributeError, SyntaxError):
         hints = get_type_hints(type(solver))
-    except (NameError, TypeError, AttributeError, SyntaxError):  # code of a plug-in
-        return {}
-    return {
-        name: hints[name]
-        for name in options_of(solver)
-        if name in hints and hints[name] not in (Any, object)
-    }
+    kind = hints.get(key, Any) if key in options_of(solver) else Any
+    if kind in (Any, object):
+        kind = type(default)
+    if kind is NoneType:
+        return _ANY
+    union = get_origin(kind) in (Union, UnionType)
+    return (*(get_args(kind) if union else (kind,)), *[NoneType] * (default is None))
+
+
+def in_words(names: Iterable[str]) -> str:
+    """Return the names of types as words for a message.
+
+    >>> in_words(["int", "NoneType"])
+    'an integer or none'
+
+    """
+    return " or ".join(dict.fromkeys(_WORDS.get(name, name) for name in names))
 
 
 def load_plugin(file: str | Path | PluginFile) -> Plugin:
@@ -394,7 +463,6 @@ def _with_backend(prefix: str, backend: str, solver: Any) -> Solver:
 def _with_options(
     spec: SolverSpec, solver: Any, *, reserved: set[str] | None = None
 ) -> Solver:
-    annotated = option_types(solver)
     changes: dict[str, Any] = {}
     settings: dict[str, Any] = {}
     for name, value in spec.options.items():
@@ -402,8 +470,7 @@ def _with_options(
         for other in reserved or ():
             known.pop(other, None)
         if name in known:
-            where, kind = f"{spec.name}: {name}", annotated.get(name)
-            value = _option(where, value, known[name], kind)
+            value = option_value(f"{spec.name}: {name}", value, solver, name)
         elif name in (reserved or ()) or not accepts_any(solver):
             raise unknown("option", name, known, where=spec.name)
         own = any(f.name == name for f in fields(solver))
@@ -418,34 +485,6 @@ def _with_options(
     except (TypeError, ValueError) as e:  # raised by the solver's check of its options
         raise InputError(f"{spec.name}: {_one_line(e)}") from None
     return configured
-
-
-def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
-    """Check the type of an option, and return its value; an int may become a float.
-
-    current : default of the option, whose type is required if there is no annotation
-    """
-    kinds = classes_of(annotation)
-    if kinds is None:
-        kinds = None if current is None else (type(current),)
-    if kinds is None or (value is None and current is None):
-        return value
-    if isinstance(value, bool):
-        if bool in kinds:
-            return value
-    elif isinstance(value, kinds):
-        return value
-    elif float in kinds and isinstance(value, int):
-        return float(value)
-    elif any(issubclass(kind, Mapping) for kind in kinds) and isinstance(
-        value, Mapping
-    ):
-        return value
-    expected = " or ".join(
-        "None" if kind is NoneType else kind.__name__ for kind in kinds
-    )
-    got = type(value).__name__
-    raise InputError(f"{where} = {value!r} is of type {got}; expected {expected}")
 
 
 def is_solver(thing: object) -> bool:

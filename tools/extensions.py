@@ -24,13 +24,11 @@ FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: flags of all
 #: Further flags by module. Without contraction to fused multiply-adds, results have the
 #: same digits on every machine.
 MODULES = {
-    "mortarbench.harness.verify.products": [],
     "mortarbench.harness.distributed.sparse": [],
     # stiffness matrices and elimination orders must also be equal on every machine
     "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
     "mortarbench.problems.fem.ordering": ["-ffp-contract=off"],
     "mortarbench.problems.fem.elimination": ["-ffp-contract=off"],
-    "mortarbench.problems.feti.blocks": [],
     # sums may be reordered for vectorisation; inf and NaN keep their meaning
     "mortarbench.solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
     "mortarbench.solvers.smalbe.faces": ["-fassociative-math", "-fno-signed-zeros"],

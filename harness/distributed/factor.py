@@ -15,9 +15,8 @@ Rows = NDArray[np.int64]
 DEPENDENCE_TOLERANCE = 1e-13
 #: Number added to a unit diagonal, since the factorisation would fail at a zero pivot.
 PIVOT_SHIFT = 1e-15
-#: Largest number of rows of a matrix that compiled code factorises as a dense array.
-#: For 500 rows, the dense factorisation already takes longer than the overhead of
-#: calling a sparse library.
+#: Largest number of rows of a matrix that is factorised as a dense array. Dense
+#: factors of more rows take more memory and time per solve than sparse ones.
 MAX_ARRAY_ROWS = 256
 
 
@@ -38,13 +37,14 @@ def bordered_factor(A: Matrix, border: Rows) -> BorderedFactor:
         If A is not positive definite.
 
     """
-    if A.shape[0] <= MAX_ARRAY_ROWS:
-        entries = A if isinstance(A, np.ndarray) else A.toarray()
+    n = A.shape[0]
+    if n <= MAX_ARRAY_ROWS:  # all rows form the border
         try:
-            return BorderedFactor.of_array(entries, border)
+            L = np.linalg.cholesky(A.toarray())
         except np.linalg.LinAlgError:
             raise DependentRowsError("the rows are linearly dependent") from None
-    inner = np.setdiff1d(np.arange(A.shape[0]), border)
+        return BorderedFactor(np.arange(n), csc_array((n, 0)), L)
+    inner = np.setdiff1d(np.arange(n), border)
     A = csc_array(A)
     if inner.size:
         inner = inner[analyze(with_int32(A[inner][:, inner]), use_long=False).P()]

@@ -12,7 +12,6 @@ cdef class CompressedRows(LinearMap):
     cdef const int *indices
     cdef const int *indptr
 
-    cdef int hold(self, tuple shape, data, indices, indptr) except -1
     cdef void times(self, const double *x, double *y) noexcept
     cdef void add_transposed(self, const double *x, double *y) noexcept
     cdef void combine(
@@ -26,19 +25,15 @@ cdef class CompressedRows(LinearMap):
 cdef class BorderedFactor(LinearMap):
     cdef Py_ssize_t inner, border
     cdef double scale
-    cdef BorderedFactor whole
+    cdef object columns
     cdef tuple arrays
     cdef const int *order
-    cdef const int *place
     cdef const int *indptr
     cdef const int *indices
     cdef const double *data
-    cdef double *L
-    cdef double *schur
+    cdef const double *L
     cdef double *u
 
-    cdef int hold(self, order, indptr, indices, data, L_bb) except -1
-    cdef int reserve(self, Py_ssize_t border) except -1
     cdef void reduce(self, const double *t, double *u) noexcept
     cdef void extend(self, double *u, double *y) noexcept
     cdef void solve_border(self, double *r, bint transposed) noexcept
@@ -46,8 +41,3 @@ cdef class BorderedFactor(LinearMap):
     cdef void backward_to(self, const double *a, double *y) noexcept
     cdef void solve_to(self, const double *t, double *y) noexcept
     cdef void scale_inner(self, double *u, double s) noexcept
-    cdef int raise_border(self, double shift) except -1
-    cdef BorderedFactor less(self, double shift, const double *block)
-    cdef BorderedFactor without(
-        self, double shift, CompressedRows columns, const double *removed
-    )

@@ -11,14 +11,12 @@ when the package is installed. `sparse.pyi` declares its types for Python, and
 """
 
 from libc.math cimport sqrt
-from libc.stdlib cimport calloc, free, realloc
+from libc.stdlib cimport free, realloc
 from libc.string cimport memcpy, memset
-from scipy.linalg.cython_blas cimport dsyrk, dtrsv
-from scipy.linalg.cython_lapack cimport dpotrf
+from scipy.linalg.cython_blas cimport dgemm, dspmv, dtrsv
 
 import numpy as np
-from scipy.linalg import blas, eigh, qr
-from scipy.sparse import csc_array
+from scipy.linalg import eigh, lapack, qr, solve_triangular
 
 
 cdef class LinearMap:
@@ -54,128 +52,14 @@ cdef class CompressedRows(LinearMap):
     def __init__(self, M):
         if M.format != "csr":
             raise ValueError(f"{M.format} matrix; expected one by rows")
-        self.hold(M.shape, M.data, M.indices, M.indptr)
-
-    @staticmethod
-    def of_transpose(M):
-        """Return Mᵀ (k, n) of M (n, k) in CSC format, without a copy of its arrays."""
-        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
-        if M.format != "csc":
-            raise ValueError(f"{M.format} matrix; expected one by columns")
-        new.hold((M.shape[1], M.shape[0]), M.data, M.indices, M.indptr)
-        return new
-
-    @staticmethod
-    def of_array(const double[:, ::1] M):
-        """Return the matrix M, without the zero entries of the array."""
-        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
-        cdef Py_ssize_t i, j, count = 0, n = M.shape[0], k = M.shape[1]
-        entries, columns = np.empty(n * k), np.empty(n * k, dtype=np.int32)
-        begin = np.zeros(n + 1, dtype=np.int32)
-        cdef double[::1] data = entries
-        cdef int[::1] indices = columns
-        cdef int[::1] indptr = begin
-        for i in range(n):
-            for j in range(k):
-                if M[i, j] != 0:
-                    data[count], indices[count] = M[i, j], <int> j
-                    count += 1
-            indptr[i + 1] = <int> count
-        new.hold((n, k), entries[:count], columns[:count], begin)
-        return new
-
-    cdef int hold(self, tuple shape, data, indices, indptr) except -1:
-        cdef const double[::1] entries = np.ascontiguousarray(data, dtype=np.float64)
-        cdef const int[::1] column = np.ascontiguousarray(indices, dtype=np.int32)
-        cdef const int[::1] begin = np.ascontiguousarray(indptr, dtype=np.int32)
-        self.shape, (self.n, self.k) = shape, shape
-        self.expect(begin.shape[0], self.n + 1)
+        cdef const double[::1] entries = np.ascontiguousarray(M.data, dtype=np.float64)
+        cdef const int[::1] column = np.ascontiguousarray(M.indices, dtype=np.int32)
+        cdef const int[::1] begin = np.ascontiguousarray(M.indptr, dtype=np.int32)
+        self.shape, (self.n, self.k) = M.shape, M.shape
         self.arrays = entries, column, begin
         self.data = &entries[0] if entries.shape[0] else NULL
         self.indices = &column[0] if column.shape[0] else NULL
         self.indptr = &begin[0]
-        return 0
-
-    def rows(self, chosen):
-        """Return the matrix (b, k) of the rows with numbers `chosen` (b,)."""
-        cdef const long long[::1] at = np.ascontiguousarray(chosen, dtype=np.int64)
-        cdef Py_ssize_t i, count = 0
-        cdef int j
-        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
-        for i in range(at.shape[0]):
-            count += self.indptr[at[i] + 1] - self.indptr[at[i]]
-        entries, columns = np.empty(count), np.empty(count, dtype=np.int32)
-        begin = np.zeros(at.shape[0] + 1, dtype=np.int32)
-        cdef double[::1] data = entries
-        cdef int[::1] indices = columns
-        cdef int[::1] indptr = begin
-        count = 0
-        for i in range(at.shape[0]):
-            for j in range(self.indptr[at[i]], self.indptr[at[i] + 1]):
-                data[count], indices[count] = self.data[j], self.indices[j]
-                count += 1
-            indptr[i + 1] = <int> count
-        new.hold((at.shape[0], self.k), entries, columns, begin)
-        return new
-
-    def unit_columns(self):
-        """Return M with columns scaled to norm 1, and the original norms (k,).
-
-        Columns of norm zero are not scaled.
-        """
-        cdef Py_ssize_t j, count = self.indptr[self.n]
-        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
-        sizes, entries = np.zeros(self.k), np.empty(count)
-        cdef double[::1] size = sizes
-        cdef double[::1] data = entries
-        for j in range(count):
-            size[self.indices[j]] += self.data[j] * self.data[j]
-        for j in range(self.k):
-            size[j] = sqrt(size[j])
-        for j in range(count):
-            data[j] = 1 / (size[self.indices[j]] or 1.0) * self.data[j]
-        new.hold(self.shape, entries, self.arrays[1], self.arrays[2])
-        return new, sizes
-
-    def transposed(self):
-        """Return Mᵀ (k, n) in CSR format."""
-        cdef Py_ssize_t i, count = self.indptr[self.n]
-        cdef int j, at
-        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
-        begin = np.zeros(self.k + 1, dtype=np.int32)
-        entries, columns = np.empty(count), np.empty(count, dtype=np.int32)
-        next_place = np.empty(self.k + 1, dtype=np.int32)
-        cdef int[::1] indptr = begin
-        cdef int[::1] place = next_place
-        cdef int[::1] indices = columns
-        cdef double[::1] data = entries
-        for j in range(count):
-            indptr[self.indices[j] + 1] += 1
-        np.cumsum(begin, out=begin)
-        next_place[:] = begin
-        for i in range(self.n):
-            for j in range(self.indptr[i], self.indptr[i + 1]):
-                at = place[self.indices[j]]
-                indices[at], data[at] = <int> i, self.data[j]
-                place[self.indices[j]] += 1
-        new.hold((self.k, self.n), entries, columns, begin)
-        return new
-
-    @property
-    def touched(self):
-        """Mask (k,) of the columns that have entries."""
-        cdef Py_ssize_t j
-        mask = np.zeros(self.k, dtype=bool)
-        cdef unsigned char[::1] has_entry = mask.view(np.uint8)
-        for j in range(self.indptr[self.n]):
-            has_entry[self.indices[j]] = 1
-        return mask
-
-    @property
-    def by_columns(self):
-        """Mᵀ (k, n) in CSC format, with the same arrays as M."""
-        data, indices, indptr = map(np.asarray, self.arrays)
-        return csc_array((data, indices, indptr), shape=(self.k, self.n))
 
     cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
         cdef Py_ssize_t i, c
@@ -256,16 +140,6 @@ cdef class CompressedRows(LinearMap):
                 j += 1
             y[i] = weights[i] * (v[i] - y_i)
 
-    def combined(self, double s, const double[::1] v, double t, const double[::1] x):
-        """Return sv + tMx (n,) for v (n,) and x (k,)."""
-        self.expect(v.shape[0], self.n)
-        self.expect(x.shape[0], self.k)
-        product = np.empty(self.n)
-        cdef double[::1] y = product
-        if self.n:
-            self.combine(s, &v[0], t, &x[0] if self.k else NULL, &y[0])
-        return product
-
     def transposed_times(self, const double[::1] x):
         """Return Mᵀx (k,) for x (n,)."""
         self.expect(x.shape[0], self.n)
@@ -282,32 +156,86 @@ cdef class CompressedRows(LinearMap):
         place : (k,) new numbers of the columns, from 0 to `size` − 1 for columns that
             have entries
         """
+        cdef Py_ssize_t i
+        cdef int j, l
+        cdef double m
         self.expect(weights.shape[0], self.n)
         self.expect(place.shape[0], self.k)
         total = np.zeros((size, size))
         cdef double[:, ::1] block = total
-        if size and self.n:
-            add_outer_products(self, 1.0, &weights[0], &place[0], &block[0, 0], size)
+        for i in range(self.n):
+            if weights[i] == 0:
+                continue
+            for j in range(self.indptr[i], self.indptr[i + 1]):
+                m = weights[i] * self.data[j]
+                for l in range(self.indptr[i], self.indptr[i + 1]):
+                    block[place[self.indices[j]], place[self.indices[l]]] += (
+                        m * self.data[l]
+                    )
         return total
 
 
-cdef void add_outer_products(
-    CompressedRows M, double s, const double *weights, const int *place, double *block,
-    Py_ssize_t size,
-) noexcept:
-    """block ← block + s Σᵢ wᵢmᵢmᵢᵀ, see `CompressedRows.outer_products`."""
-    cdef Py_ssize_t i
-    cdef int j, l
-    cdef double *row
-    cdef double m
-    for i in range(M.n):
-        if weights[i] == 0:
-            continue
-        for j in range(M.indptr[i], M.indptr[i + 1]):
-            row = block + place[M.indices[j]] * size
-            m = s * weights[i] * M.data[j]
-            for l in range(M.indptr[i], M.indptr[i + 1]):
-                row[place[M.indices[l]]] += m * M.data[l]
+cdef class Block(LinearMap):
+    """The map X ↦ MX of matrices X (n, w), stored by rows as vectors.
+
+    Each of the w columns belongs to one member of a class of congruent subdomains.
+
+    M : array (r, n) or a square object with `@`; for w = 1, a symmetric array may be
+        replaced by its upper triangle (n (n + 1)/2,), stored by columns
+    n, members : n and w
+
+    Raises
+    ------
+    ValueError
+        If the shape of M does not match n and w.
+
+    """
+
+    cdef object M
+    cdef const double *entries  # NULL if M is not an array
+    cdef int rows, size, members
+    cdef bint is_triangle
+
+    def __init__(self, M, n, members):
+        cdef const double[::1] entries
+        self.rows = self.size = n
+        self.members = members
+        if isinstance(M, np.ndarray):
+            self.is_triangle = M.ndim == 1
+            expected = (n * (n + 1) // 2,) if self.is_triangle else (len(M), n)
+            if M.shape != expected or (self.is_triangle and members != 1):
+                raise ValueError(
+                    f"a block {M.shape} cannot multiply a ({n}, {members}) array"
+                )
+            if not self.is_triangle:
+                self.rows = len(M)
+            M = np.ascontiguousarray(M, dtype=np.float64)
+            if M.size:
+                entries = M.reshape(-1)
+                self.entries = &entries[0]
+        self.M = M
+        self.n, self.k = self.rows * self.members, self.size * self.members
+        self.shape = self.n, self.k
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        cdef int c, w = <int> (self.members * columns), step = <int> columns
+        cdef double one = 1.0, zero = 0.0
+        if not self.k:
+            memset(y, 0, self.n * columns * sizeof(double))
+        elif not self.n:
+            return 0
+        elif not self.entries:
+            X = np.asarray(<double[:self.size, :w]> <double *> x)
+            Y = np.asarray(<double[:self.rows, :w]> y)
+            Y[:] = self.M @ X
+        elif self.is_triangle:
+            for c in range(step):
+                dspmv(b"U", &self.size, &one, <double *> self.entries, <double *> x + c,
+                      &step, &zero, y + c, &step)
+        else:  # BLAS reads matrices by columns, and computes (MX)ᵀ = XᵀMᵀ
+            dgemm(b"N", b"N", &w, &self.rows, &self.size, &one, <double *> x, &w,
+                  <double *> self.entries, &self.size, &zero, y, &w)
+        return 0
 
 
 cdef class Composition(LinearMap):
@@ -388,24 +316,7 @@ cdef double *resized(double *held, Py_ssize_t size) except NULL:
 
 # Largest relative amount by which a squared pivot may be below its lower bound, since
 # both values are rounded.
-cdef double PIVOT_TOLERANCE = 1e-3
-
-
-cdef bint factorised_above(
-    double *M, Py_ssize_t k, double share, const double *L_0
-) noexcept:
-    """Factorise M (k, k) in place; return False if a pivot is below its lower bound."""
-    cdef int n = k, info = 0
-    cdef Py_ssize_t i
-    cdef double pivot, least
-    dpotrf(b"L", &n, M, &n, &info)
-    if info:
-        return False
-    for i in range(k):
-        pivot, least = M[i * k + i], L_0[i * k + i]
-        if not pivot * pivot >= (1 - PIVOT_TOLERANCE) * share * least * least:
-            return False
-    return True
+PIVOT_TOLERANCE = 1e-3
 
 
 cdef class BorderedFactor(LinearMap):
@@ -415,153 +326,38 @@ cdef class BorderedFactor(LinearMap):
 
     ::
 
-        A = LLᵀ,   L = ⎡L_aa     ⎤     with the rows of A in the order `order`.
-                       ⎣L_ba  L_bb⎦
+        A = LLᵀ,   L = ⎡√s L_aa     ⎤   with the rows of A in the order `order`.
+                       ⎣√s L_ba  L_bb⎦
 
     If A changes only on the border, it suffices to factorise the new Schur complement
     L_bbL_bbᵀ. As a linear map, an object of this class is x ↦ A⁻¹x.
 
     order : (n,) permutation of the rows, with the border last
-    columns : first n − b columns of L (n, n − b) in CSC format, each with its diagonal
-        entry first
+    columns : first n − b columns (n, n − b) of L/√s in CSC format, each with its
+        diagonal entry first
     L_bb : (b, b) lower triangular; the upper triangle is not used
+    scale : s
     """
 
-    def __init__(self, order, columns, L_bb):
-        self.hold(order, columns.indptr, columns.indices, columns.data,
-                  np.asfortranarray(L_bb, dtype=np.float64))
-
-    cdef int hold(self, order, indptr, indices, data, L_bb) except -1:
+    def __init__(self, order, columns, L_bb, scale=1.0):
         cdef const int[::1] rows = np.ascontiguousarray(order, dtype=np.int32)
-        cdef const int[::1] begin = np.ascontiguousarray(indptr, dtype=np.int32)
-        cdef const int[::1] index = np.ascontiguousarray(indices, dtype=np.int32)
-        cdef const double[::1] entries = np.ascontiguousarray(data, dtype=np.float64)
-        cdef const double[::1, :] corner = L_bb
-        cdef Py_ssize_t i, j, b = corner.shape[0]
-        cdef int size = b
-        cdef double one = 1.0, zero = 0.0
-        cdef int[::1] place = np.empty(rows.shape[0], dtype=np.int32)
+        cdef const int[::1] begin = np.ascontiguousarray(columns.indptr, dtype=np.int32)
+        cdef const int[::1] index = np.ascontiguousarray(columns.indices, dtype=np.int32)
+        cdef const double[::1] entries = np.ascontiguousarray(columns.data)
+        cdef const double[::1, :] corner = np.asfortranarray(L_bb, dtype=np.float64)
+        cdef double[::1] u = np.empty(rows.shape[0])
         self.n = self.k = rows.shape[0]
-        self.shape, self.inner, self.scale = (self.n, self.n), self.n - b, 1.0
+        self.shape, self.scale, self.columns = (self.n, self.n), scale, columns
+        self.border, self.inner = corner.shape[0], self.n - corner.shape[0]
         self.expect(begin.shape[0] - 1, self.inner)
-        for i in range(self.n):
-            place[rows[i]] = <int> (i - self.inner)
-        self.arrays = rows, place, begin, index, entries
-        if self.n:
-            self.order, self.place = &rows[0], &place[0]
+        self.arrays = rows, begin, index, entries, corner, u
         self.indptr = &begin[0]
-        self.indices = &index[0] if index.shape[0] else NULL
-        self.data = &entries[0] if entries.shape[0] else NULL
-        self.reserve(b)
-        self.schur = <double *> calloc(max(b * b, 1), sizeof(double))
-        if not self.schur:
-            raise MemoryError
-        for j in range(b):
-            for i in range(j, b):
-                self.L[j * b + i] = corner[i, j]
-        if b:  # dsyrk computes the lower triangle of L_bbL_bbᵀ, which is then mirrored
-            dsyrk(b"L", b"N", &size, &size, &one, self.L, &size, &zero, self.schur,
-                  &size)
-        for j in range(b):
-            for i in range(j):
-                self.schur[j * b + i] = self.schur[i * b + j]
-        return 0
-
-    def __dealloc__(self):
-        free(self.L)
-        free(self.schur)
-        free(self.u)
-
-    cdef int reserve(self, Py_ssize_t border) except -1:
-        self.border = border
-        self.L = <double *> calloc(max(border * border, 1), sizeof(double))
-        self.u = <double *> calloc(max(self.n, 1), sizeof(double))
-        if not self.L or not self.u:
-            raise MemoryError
-        return 0
-
-    @staticmethod
-    def of_array(A, border):
-        """Factorise an array A (n, n) with few nonzeros.
-
-        In each step, the remaining row with the fewest nonzeros is eliminated (minimum
-        degree). Rows of the border are eliminated last.
-
-        border : (b,) numbers of the rows of the border
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If A is not positive definite.
-
-        """
-        cdef BorderedFactor new = BorderedFactor.__new__(BorderedFactor)
-        cdef const long long[::1] last = np.ascontiguousarray(border, dtype=np.int64)
-        cdef Py_ssize_t n = len(A), i, j, l, m, p, step, count = 0
-        cdef Py_ssize_t inner = n - last.shape[0]
-        cdef double[:, ::1] M = np.array(A, dtype=np.float64, order="C")
-        cdef double root, share
-        cdef int size, info = 0
-        order, begin = np.empty(n, dtype=np.int32), np.zeros(inner + 1, dtype=np.int32)
-        indices, data = np.empty(inner * n, dtype=np.int32), np.empty(inner * n)
-        corner = np.empty((n - inner, n - inner), order="F")
-        cdef int[:, ::1] work = np.zeros((5, n), dtype=np.int32)
-        cdef int[::1] degree = work[0]
-        cdef int[::1] neighbour = work[1]
-        cdef int[::1] is_done = work[2]
-        cdef int[::1] place = work[3]
-        cdef int[::1] is_last = work[4]
-        cdef int[::1] row = order
-        cdef int[::1] indptr = begin
-        cdef int[::1] index = indices
-        cdef double[::1] value = data
-        cdef double[::1, :] L_bb = corner
-        for i in range(n - inner):
-            is_last[last[i]] = 1
-            row[inner + i] = <int> last[i]
-        for i in range(n):
-            for j in range(n):
-                degree[i] += M[i, j] != 0
-        for step in range(inner):
-            p = -1
-            for i in range(n):
-                if not is_done[i] and not is_last[i] and (
-                    p < 0 or degree[i] < degree[p]
-                ):
-                    p = i
-            if not M[p, p] > 0:
-                raise np.linalg.LinAlgError("not positive definite")
-            row[step], is_done[p], root, m = <int> p, 1, sqrt(M[p, p]), 0
-            index[count], value[count] = <int> p, root
-            for i in range(n):
-                if not is_done[i] and M[p, i] != 0:
-                    neighbour[m] = <int> i
-                    m += 1
-                    index[count + m], value[count + m] = <int> i, M[p, i] / root
-                    degree[i] -= 1
-            for j in range(m):
-                share = value[count + 1 + j]
-                for l in range(m):
-                    i = neighbour[l]
-                    if M[neighbour[j], i] == 0:
-                        degree[i] += 1
-                    M[neighbour[j], i] -= share * value[count + 1 + l]
-            count += m + 1
-            indptr[step + 1] = <int> count
-        for i in range(n):
-            place[row[i]] = <int> i
-        for j in range(count):
-            index[j] = place[index[j]]
-        for j in range(n - inner):
-            for i in range(n - inner):
-                L_bb[i, j] = M[row[inner + i], row[inner + j]]
-        size = <int> (n - inner)
-        if size:
-            dpotrf(b"L", &size, &L_bb[0, 0], &size, &info)
-        if info:
-            raise np.linalg.LinAlgError("not positive definite")
-        new.hold(order, begin, indices[:count], data[:count], corner)
-        return new
+        if self.n:
+            self.order, self.u = &rows[0], &u[0]
+        if self.inner:
+            self.indices, self.data = &index[0], &entries[0]
+        if self.border:
+            self.L = &corner[0, 0]
 
     # forward and backward substitution, with a factor that is not yet scaled
 
@@ -595,9 +391,10 @@ cdef class BorderedFactor(LinearMap):
         """r ← L_bb⁻¹r, or L_bb⁻ᵀr if `transposed`."""
         cdef int b = self.border, one = 1
         if b:
-            dtrsv(b"L", b"T" if transposed else b"N", b"N", &b, self.L, &b, r, &one)
+            dtrsv(b"L", b"T" if transposed else b"N", b"N", &b, <double *> self.L, &b, r,
+                  &one)
 
-    # solves with the scaled factor, whose L_aa and L_ba are multiplied by √scale
+    # solves with the scaled factor
 
     cdef void forward_to(self, const double *t, double *a) noexcept:
         """a ← L⁻¹t."""
@@ -662,91 +459,12 @@ cdef class BorderedFactor(LinearMap):
     @property
     def least_pivot(self):
         """Smallest diagonal entry of L; inf for n = 0."""
-        cdef Py_ssize_t i
-        cdef double least = float("inf")
-        for i in range(self.inner):
-            least = min(least, sqrt(self.scale) * self.data[self.indptr[i]])
-        for i in range(self.border):
-            least = min(least, self.L[i * self.border + i])
-        return least
+        first = self.columns.data[self.columns.indptr[: self.inner]]
+        last = np.diag(self.arrays[4])
+        return min(sqrt(self.scale) * first.min(initial=np.inf), last.min(initial=np.inf))
 
-    @property
-    def entries(self):
-        """Number of stored entries of L."""
-        return self.indptr[self.inner] + self.border * (self.border + 1) // 2
-
-    # changes of the border
-
-    cdef BorderedFactor less(self, double shift, const double *block):
-        """Return the factor of (1 + shift)A minus a block (b, b) on the border."""
-        cdef BorderedFactor new = BorderedFactor.__new__(BorderedFactor)
-        cdef Py_ssize_t i, b = self.border
-        new.n, new.k, new.shape = self.n, self.k, self.shape
-        new.inner, new.scale, new.arrays = self.inner, 1 + shift, self.arrays
-        new.order, new.place, new.indptr = self.order, self.place, self.indptr
-        new.indices, new.data = self.indices, self.data
-        new.whole = self
-        new.reserve(b)
-        for i in range(b * b):
-            new.L[i] = (1 + shift) * self.schur[i] - block[i]
-        if b and not factorised_above(new.L, b, shift, self.L):
-            for i in range(b * b):
-                new.L[i] = (1 + shift) * self.schur[i] - block[i]
-            new.raise_border(shift)
-        return new
-
-    cdef int raise_border(self, double shift) except -1:
-        """Factorise the Schur complement M stored in `L`, despite rounding.
-
-        In exact arithmetic, M ≥ shift·L₀L₀ᵀ with the factor L₀ of `whole`. Since M is a
-        difference of matrices whose norms are similar to that of L₀L₀ᵀ, the computed M
-        may have negative eigenvalues. Therefore, eigenvalues of L₀⁻¹ML₀⁻ᵀ = QλQᵀ below
-        `shift` are set to `shift`, and L follows from
-
-            LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
-
-        which contains no difference of matrices and therefore preserves the lower
-        bound.
-        """
-        cdef Py_ssize_t i, j, b = self.border
-        M, L_0 = np.empty((b, b), order="F"), np.zeros((b, b), order="F")
-        cdef double[::1, :] at = M
-        cdef double[::1, :] lower = L_0
-        for j in range(b):
-            for i in range(b):
-                at[i, j] = self.L[j * b + i]
-            for i in range(j, b):
-                lower[i, j] = self.whole.L[j * b + i]
-        inner = blas.dtrsm(1.0, L_0, blas.dtrsm(1.0, L_0, M, lower=1).T, lower=1)
-        size, Q = eigh((inner + inner.T) / 2)
-        half = blas.dtrmm(1.0, L_0, Q * np.sqrt(np.maximum(size, shift)), lower=1)
-        (R,) = qr(half.T, mode="r", overwrite_a=True)
-        cdef const double[::1, :] L = np.asfortranarray(
-            R.T * np.where(np.diag(R) < 0, -1.0, 1.0)
-        )
-        for j in range(b):
-            for i in range(j, b):
-                self.L[j * b + i] = L[i, j]
-        return 0
-
-    cdef BorderedFactor without(
-        self, double shift, CompressedRows columns, const double *removed
-    ):
-        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ, see `shifted_without`."""
-        cdef Py_ssize_t b = self.border
-        cdef double *block = <double *> calloc(max(b * b, 1), sizeof(double))
-        if not block:
-            raise MemoryError
-        add_outer_products(columns, 1.0, removed, self.place, block, b)
-        try:
-            return self.less(shift, block)
-        finally:
-            free(block)
-
-    def shifted_without(
-        self, double shift, CompressedRows columns, const double[::1] removed
-    ):
-        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ.
+    def shifted_without(self, double shift, CompressedRows columns, removed):
+        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ, for a factor with scale 1.
 
         In exact arithmetic, the difference must be at least shift·A. The computed
         pivots satisfy the resulting lower bounds despite rounding.
@@ -754,5 +472,34 @@ cdef class BorderedFactor(LinearMap):
         columns : matrix whose rows are the mᵢ (n,), with entries on the border only
         removed : weights wᵢ, each 0 or 1
         """
-        columns.expect(removed.shape[0], columns.n)
-        return self.without(shift, columns, &removed[0] if columns.n else NULL)
+        order, corner = np.asarray(self.arrays[0]), np.tril(self.arrays[4])
+        place = np.empty(self.n, dtype=np.int32)
+        place[order] = np.arange(-self.inner, self.border, dtype=np.int32)
+        L = np.zeros((0, 0))
+        if self.border:
+            M = (1 + shift) * (corner @ corner.T)
+            M -= columns.outer_products(removed, place, self.border)
+            L, failed = lapack.dpotrf(M, lower=1)
+            least = (1 - PIVOT_TOLERANCE) * shift * np.diag(corner) ** 2
+            if failed or not (np.diag(L) ** 2 >= least).all():
+                L = raised(M, corner, shift)
+        return BorderedFactor(order, self.columns, L, 1 + shift)
+
+
+def raised(M, L_0, shift):
+    """Factorise a Schur complement M ≥ shift·L₀L₀ᵀ despite rounding.
+
+    Since M is a difference of matrices whose norms are similar to that of L₀L₀ᵀ, the
+    computed M may have negative eigenvalues. Therefore, eigenvalues of L₀⁻¹ML₀⁻ᵀ = QλQᵀ
+    below `shift` are set to `shift`, and L follows from
+
+        LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
+
+    which contains no difference of matrices and therefore preserves the lower bound.
+    """
+    half = solve_triangular(L_0, M, lower=True)
+    inner = solve_triangular(L_0, half.T, lower=True)
+    size, Q = eigh((inner + inner.T) / 2)
+    root = L_0 @ (Q * np.sqrt(np.maximum(size, shift)))
+    (R,) = qr(root.T, mode="r")
+    return R.T * np.where(np.diag(R) < 0, -1.0, 1.0)

@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL, Popen
 from tempfile import TemporaryDirectory
@@ -131,9 +132,35 @@ class Cluster:
             If a node is unsuitable, or if the scheduler or all workers are lost.
 
         """
-        pending: dict[Any, WorkUnit] = {}
+        from distributed import KilledWorker, wait
+
+        pending: dict[Any, WorkUnit] = {}  # submitted blocks by future
         try:
-            yield from self._execute(blocks, commands, pending)
+            self._await_workers(None)
+            task = self._task(commands)
+            while True:
+                self._await_workers(LOST_SECONDS)
+                free = len(self.client.nthreads()) - len(pending)
+                while free > 0 and (block := next(blocks, None)) is not None:
+                    pending[self.client.submit(task, block, pure=False)] = block
+                    free -= 1
+                if not pending:
+                    return
+                with suppress(TimeoutError):
+                    wait(
+                        [*pending], CLUSTER_POLL_SECONDS, return_when="FIRST_COMPLETED"
+                    )
+                for future in [each for each in pending if each.done()]:
+                    block = pending.pop(future)
+                    try:
+                        outcomes, *there = future.result()
+                    except KilledWorker:
+                        case = block.turns[0][0].case
+                        reason = f"{case} was given up: its Dask workers were lost"
+                        outcomes = [BuildFailure(block=block, reason=reason)]
+                    else:
+                        self.add_node(*there)
+                    yield from outcomes
         except Exception as e:
             if isinstance(e, InputError) or self.client.status == "running":
                 raise
@@ -145,20 +172,13 @@ class Cluster:
             with suppress(Exception):  # the scheduler may be gone
                 self.client.cancel([*pending], force=True)
 
-    def _execute(
-        self,
-        blocks: Iterator[WorkUnit],
-        commands: Commands,
-        pending: dict[Any, WorkUnit],
-    ) -> Iterator[Outcome]:
-        """Execute all blocks; `pending` contains the submitted blocks by future."""
-        from distributed import KilledWorker, wait
+    def _task(self, commands: Commands) -> Callable[[WorkUnit], Any]:
+        """Return the function that measures a block in a Dask worker."""
+        from mortarbench.harness.running.dask_worker import measure
 
-        from mortarbench.harness.running.dask_worker import Setup, measure
-
-        self._await_workers(None)
         info = self.client.scheduler_info(n_workers=-1)["workers"].values()
-        setup = Setup(
+        return partial(
+            measure,
             run=self.client.id,
             commands=commands,
             plugins=tuple(file.resolved() for file in self.plugins),
@@ -166,31 +186,6 @@ class Cluster:
             sharing=max(Counter(worker["host"] for worker in info).values()),
             packages=tuple(packages_of(self.environment)),
         )
-        while True:
-            self._await_workers(LOST_SECONDS)
-            free = len(self.client.nthreads()) - len(pending)
-            while free > 0 and (block := next(blocks, None)) is not None:
-                pending[self.client.submit(measure, setup, block, pure=False)] = block
-                free -= 1
-            if not pending:
-                return
-            try:
-                done, _ = wait(
-                    [*pending], CLUSTER_POLL_SECONDS, return_when="FIRST_COMPLETED"
-                )
-            except TimeoutError:
-                continue
-            for future in done:
-                block = pending.pop(future)
-                try:
-                    outcomes, *there = future.result()
-                except KilledWorker:
-                    case = block.turns[0][0].case
-                    reason = f"{case} was given up: its Dask workers were lost"
-                    yield BuildFailure(block=block, reason=reason)
-                    continue
-                self.add_node(*there)
-                yield from outcomes
 
     def _await_workers(self, seconds: float | None) -> None:
         """Wait until the cluster has a worker.
@@ -214,9 +209,7 @@ class Cluster:
             ) from None
 
     def add_node(self, node: str, environment: Mapping[str, Any]) -> None:
-        """Store an environment if it is new, and warn if it differs from the parent's.
-
-        node : name of the machine, for messages
+        """Store the environment of a node if it is new.
 
         Raises
         ------
@@ -227,18 +220,12 @@ class Cluster:
         name = digest(environment)
         if name in self._stored:
             return
-        changed = list(differences(self.environment, environment))
-        code = [each for each in changed if each[0].startswith(_CODE)]
-        what = in_words(code or changed, "here", "there")
-        if code:
+        changed = differences(self.environment, environment)
+        if code := [each for each in changed if each[0].startswith(_CODE)]:
             raise InputError(
-                f"{node} runs different code from this machine ({what}); install the "
-                "same code on every node"
+                f"{node} runs different code from this machine "
+                f"({in_words(code, 'here', 'there')}); install the same code on every "
+                "node"
             )
         self._stored.add(name)
         self.keep(name, environment)
-        if changed:
-            self.warn(
-                f"{node} measures under different conditions from this machine "
-                f"({what}); its times are marked as those of environment {name}"
-            )

@@ -7,7 +7,7 @@ import os
 import platform
 from collections.abc import Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 from tempfile import gettempdir
@@ -25,21 +25,22 @@ from mortarbench.harness.results.work_unit import Commands, Outcome, WorkUnit
 from mortarbench.harness.running.executor import Executor
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Setup:
-    """Data of a run that each of its blocks needs on a node."""
-
-    run: str  #: name that no other run on the cluster has
-    commands: Commands
-    plugins: tuple[PluginFile, ...]
-    operators: Mapping[str, Maker]  #: makers of operators P, except those of `plugins`
-    #: largest number of Dask workers on one machine, which disturb each other
-    sharing: int
-    packages: tuple[str, ...]  #: packages whose versions an environment contains
-
-
-def measure(setup: Setup, block: WorkUnit) -> tuple[list[Outcome], str, dict[str, Any]]:
+def measure(
+    block: WorkUnit,
+    *,
+    run: str,
+    commands: Commands,
+    plugins: tuple[PluginFile, ...],
+    operators: Mapping[str, Maker],
+    sharing: int,
+    packages: tuple[str, ...],
+) -> tuple[list[Outcome], str, dict[str, Any]]:
     """Measure a block in a Dask worker; stop early if the run has ended.
+
+    run : name that no other run on the cluster has
+    operators : makers of operators P, except those of the plug-ins
+    sharing : largest number of Dask workers on one machine, which disturb each other
+    packages : packages whose versions an environment contains
 
     The CPU of this Dask worker also measures the blocks of its other runs. Built cases
     remain in the folder of the Dask worker until it ends.
@@ -61,18 +62,17 @@ def measure(setup: Setup, block: WorkUnit) -> tuple[list[Outcome], str, dict[str
             "blocks at a time, so that they would disturb each other; start it with "
             "--nthreads 1"
         )
-    for path in (Path(setup.commands.case_worker[0]), *(p.path for p in setup.plugins)):
+    for path in (Path(commands.case_worker[0]), *(p.path for p in plugins)):
         if not path.is_file():
             raise InputError(
                 f"{node}: no file {path}; expected the same interpreter and plug-ins "
                 "under the same paths on every node"
             )
-    environment = _environment(setup.run, setup.plugins, setup.packages)
-    if setup.sharing > 1:
-        environment["machine"]["shared_by_workers"] = setup.sharing
+    environment = _environment(run, plugins, packages)
+    if sharing > 1:
+        environment["machine"]["shared_by_workers"] = sharing
     name = digest(environment)
-    operators = setup.operators
-    for file in setup.plugins:
+    for file in plugins:
         operators = merged("operator", operators, load_plugin(file).operators)
 
     turns = tuple(
@@ -80,11 +80,11 @@ def measure(setup: Setup, block: WorkUnit) -> tuple[list[Outcome], str, dict[str
         for turn in block.turns
     )
     os.sched_setaffinity(0, {claim_cpu()})  # binds only this thread
-    scratch = Path(worker.local_directory, f"mortarbench-{setup.run}")
+    scratch = Path(worker.local_directory, f"mortarbench-{run}")
     scratch.mkdir(exist_ok=True)
     task = worker.state.tasks[worker.get_current_task()]
     outcomes: list[Outcome] = []
-    executor = Executor(setup.commands, scratch, scratch / "cases", operators)
+    executor = Executor(commands, scratch, scratch / "cases", operators)
     with closing(executor):
         try:
             for outcome in executor.execute(replace(block, turns=turns)):

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import product
 from math import prod
 from numbers import Integral, Real
-from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from types import NoneType
+from typing import Any
 
 import msgspec
 
@@ -27,28 +28,15 @@ from mortarbench.harness.registry import (
     accepts_any,
     known_options,
     option_types,
+    option_value,
     resolve,
 )
 
 #: End of the label of the second copy of a solver in an A/A comparison (``null_arm``).
 NULL_SUFFIX = " (A/A)"
 _KEY = re.compile(r"(?:[^=]+\.)?[^\W\d]\w*")
-#: types of an option whose default is None and that has no annotation; an integer is
-#: not read as a float, and 1 is not read as true
-_ANY = (int, float, bool, str, NoneType)
 _PLAIN = (bool, Real, str, NoneType)  #: types of values that Python callers may pass
 _MAX_VARIANTS = 1000  #: largest number of variants of one solver
-#: types in messages, by the names that Python or msgspec use
-_WORDS = {
-    "int": "an integer",
-    "float": "a number",
-    "bool": "true or false",
-    "str": "a string",
-    "NoneType": "none",
-    "null": "none",
-    "array": "a list",
-    "object": "a table",
-}
 
 
 def parse_options(texts: Iterable[str]) -> dict[str, list[Any]]:
@@ -196,7 +184,7 @@ def grid(spec: SolverSpec, registry: Mapping[str, Solver]) -> Iterator[SolverSpe
         for key, value in spec.options.items()
         if isinstance(value, list)
         and key in known_options(solver, key)
-        and not _is_value(value, _kinds(solver, key))
+        and not _is_value(value, solver, key)
     }
     fixed = {k: v for k, v in spec.options.items() if k not in axes}
     return with_values(replace(spec, options=fixed), axes, registry)
@@ -215,7 +203,7 @@ def with_values(
     null = NULL_SUFFIX if spec.role == "null" else ""
     for values in product(*axes.values()):
         options = {
-            key: _typed(f"{spec.name}: {key}", value, solver, key)
+            key: option_value(f"{spec.name}: {key}", value, solver, key, strict=False)
             for key, value in zip(axes, values, strict=True)
         }
         label = f"{with_options(spec.label.removesuffix(null), options)}{null}"
@@ -224,51 +212,13 @@ def with_values(
         yield variant
 
 
-def _kinds(solver: Solver, key: str) -> tuple[Any, ...]:
-    """Return the types of the values of an option; None is one if it is the default."""
-    default = known_options(solver, key).get(key)
-    kind = option_types(solver).get(key, type(default))
-    if kind is NoneType:
-        return _ANY
-    union = get_origin(kind) in (Union, UnionType)
-    return (*(get_args(kind) if union else (kind,)), *[NoneType] * (default is None))
-
-
-def _typed(where: str, value: Any, solver: Solver, key: str) -> Any:
-    """Convert a value, often a text, to the first type of the option that admits it."""
-    kinds = _kinds(solver, key)
-    if NoneType in kinds and value in (None, "none"):
-        return None
-    plain = value.item() if hasattr(value, "item") else value  # scalars of NumPy
-    for kind in kinds:
-        if _is_value(plain, (kind,), strict=False):
-            return msgspec.convert(plain, kind, strict=False)
-    names: list[str] = []
-    for kind in kinds:
-        choices = get_args(kind) if get_origin(kind) is Literal else ()
-        names += map(_text, choices) if choices else [kind.__name__]
-    raise InputError(f"{where} = {shown(value)}; expected {in_words(names)}")
-
-
-def _is_value(value: object, kinds: Iterable[Any], *, strict: bool = True) -> bool:
-    """Return True if one of the types admits a value."""
-    for kind in kinds:
-        try:
-            msgspec.convert(value, kind, strict=strict)
-        except (msgspec.ValidationError, TypeError):  # TypeError: a class of a plug-in
-            continue
-        return True
+def _is_value(value: object, solver: Solver, key: str) -> bool:
+    """Return True if a list is itself a value of an option."""
+    for kind in option_types(solver, key):
+        with suppress(msgspec.ValidationError, TypeError):
+            msgspec.convert(value, kind)
+            return True
     return False
-
-
-def in_words(names: Iterable[str]) -> str:
-    """Return the names of types as words for a message.
-
-    >>> in_words(["int", "NoneType"])
-    'an integer or none'
-
-    """
-    return " or ".join(dict.fromkeys(_WORDS.get(name, name) for name in names))
 
 
 def with_options(label: str, options: Mapping[str, Any]) -> str:

@@ -19,9 +19,9 @@ from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, read_toml, toml
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Family, Solver
-from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.registry import SolverSpec, in_words, resolve
 from mortarbench.harness.suite.parameter_grid import Problem, Text, expand_problems
-from mortarbench.harness.suite.solver_options import NULL_SUFFIX, grid, in_words
+from mortarbench.harness.suite.solver_options import NULL_SUFFIX, grid
 
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Fraction = Annotated[float, Meta(gt=0, lt=1)]

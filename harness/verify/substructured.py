@@ -50,9 +50,9 @@ from mortarbench.harness.mechanics import (
     Mechanics,
     Real,
     cancelling,
+    in_precision,
 )
 from mortarbench.harness.qp import Vector
-from mortarbench.harness.verify.products import times_columns, times_rows
 
 #: Safety factor for the relative difference of the energies in K and K_T, which is
 #: estimated at û. The relative difference is largest for displacements of low energy,
@@ -279,8 +279,7 @@ class Undivided(Split):
     def product(self, v: Extended) -> Extended:
         """Apply PKP with P = I − RRᵀ."""
         K, v = csc_array(self.bodies.primal.P), self.motions.without(v)
-        Kv = times_columns(K.data, K.indices, K.indptr, v, v.size)
-        return self.motions.without(Kv)
+        return self.motions.without(in_precision(K, Real) @ v)
 
     def solve(self, rho: Extended) -> Vector:
         """Return K⁺ρ."""
@@ -355,12 +354,11 @@ class Subdomains(Split):
 
     def spread(self, u: Extended) -> Extended:
         """Return Tu (N,)."""
-        return times_rows(self._T.data, self._T.indices, self._T.indptr, u)
+        return np.asarray(in_precision(self._T, Real) @ u)
 
     def joined(self, b: Extended) -> Extended:
         """Return Tᵀb (n,) with zeros on fixed components."""
-        T, n = self._T, self.exact.f.size
-        return self.free(times_columns(T.data, T.indices, T.indptr, b, n))
+        return self.free(in_precision(self._T, Real).T @ b)
 
     def averaged(self, v: Extended) -> Extended:
         """Return averages (n,) after the subdomains have moved rigidly.

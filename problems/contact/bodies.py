@@ -76,18 +76,6 @@ def slave_places(pairs: Sequence[ContactPair]) -> int:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ContactSides:
-    """Contact sides of bodies, without the interior of the bodies."""
-
-    mesh: Mesh  #: nodes of the sides, without cells; lengths in m
-    body_of_node: NDArray[np.int64]  #: (N,) body of each node
-    names: tuple[str, ...]  #: names of all bodies
-    pairs: tuple[ContactPair, ...]
-    length: float  #: l, unit of length of the QPs, m
-    force: float  #: F₀, unit of force of the QPs: N/m in 2D, N in 3D
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class UnassembledBodies:
     """Bodies without stiffness matrix: mesh, materials, supports, load, contact sides.
 

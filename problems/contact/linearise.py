@@ -13,7 +13,6 @@ from mortarbench.harness import InputError, Vector
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
-    ContactSides,
     UnassembledBodies,
 )
 from mortarbench.problems.contact.face_mortar import face_mortar
@@ -38,7 +37,7 @@ from mortarbench.problems.fem.mesh import Nodes
 
 
 def linearisation(
-    bodies: UnassembledBodies | ContactSides,
+    bodies: UnassembledBodies,
     contact: str,
     basis: Any,
     laws: Sequence[FrictionLaw] = (),
@@ -175,7 +174,7 @@ def closest_segments(bodies: Bodies, u: Vector) -> Nodes:
 
 
 def _split_by_pair(
-    bodies: UnassembledBodies | ContactSides, values: NDArray[Any]
+    bodies: UnassembledBodies, values: NDArray[Any]
 ) -> list[NDArray[Any]]:
     """Split an array with one entry per slave node into one array per pair."""
     ends = np.cumsum([pair.slave_nodes.size for pair in bodies.pairs])[:-1]

@@ -12,7 +12,6 @@ from mortarbench.harness.plugin import SLIDING
 from mortarbench.harness.sets.blocks import norms
 from mortarbench.problems.contact.bodies import (
     ContactPair,
-    ContactSides,
     UnassembledBodies,
 )
 from mortarbench.problems.contact.rows import (
@@ -194,7 +193,7 @@ def active(normal: Vector) -> NDArray[np.bool_]:
     return np.asarray(normal > ACTIVE_THRESHOLD * normal.max(initial=0.0))
 
 
-def pair_names(bodies: UnassembledBodies | ContactSides) -> list[str]:
+def pair_names(bodies: UnassembledBodies) -> list[str]:
     """Return the names "SLAVE on MASTER" of all pairs; repetitions get a number > 1."""
     names: list[str] = []
     for pair in bodies.pairs:
@@ -205,9 +204,7 @@ def pair_names(bodies: UnassembledBodies | ContactSides) -> list[str]:
     return names
 
 
-def bodies_of(
-    bodies: UnassembledBodies | ContactSides, pair: ContactPair
-) -> tuple[str, str]:
+def bodies_of(bodies: UnassembledBodies, pair: ContactPair) -> tuple[str, str]:
     """Return the names of the bodies of slave and master."""
 
     def owner(side: Nodes) -> str:

@@ -133,8 +133,6 @@ def decomposed_path(
             b=np.zeros(stage.fixed.size),
             G=rows.B,
             h=rows.c / bodies.length,
-            lb=np.full(zero.size, -np.inf),
-            ub=np.full(zero.size, np.inf),
         )
         contact = contact_of(primal, friction)
         parts = decompose(elastic, layout, choice.glue, stage, contact)

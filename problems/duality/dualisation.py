@@ -200,8 +200,6 @@ def _dual(
         q=c - B @ free,
         A=np.ascontiguousarray((B @ R).T) if moves else no_rows(c.size),
         b=R.T @ f if moves else np.zeros(0),
-        G=no_rows(c.size),
-        h=np.zeros(0),
         sets=multiplier_sets(m_E, primal.h.size, friction.bound, friction.tangents),
         structure=structure,
     )

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
+from mortarbench.harness import QP, Friction, Solution, Vector
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.mechanics import NO_FRICTION, Substructures, contact_rows
 from mortarbench.harness.sets.convex import ConvexSet
@@ -79,8 +79,6 @@ class TornDual:
             q=c - B @ self.free,
             A=csr_array((B @ self.R).T),
             b=self.R.T @ self.torn.f,
-            G=no_rows(c.size),
-            h=np.zeros(0),
             sets=self.sets,
         )
 

@@ -199,7 +199,7 @@ def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP
     The QP minimises ½uᵀKu − fᵀu subject to B_D u = B_D w and B_M u ≤ c_M, where f and w
     are the load and the prescribed displacements of `bodies` times `load_factor`.
     """
-    n, m = bodies.B_D.shape[::-1]
+    m = bodies.B_D.shape[0]
     return QP(
         P=bodies.K,
         q=-load_factor * bodies.f,
@@ -209,6 +209,4 @@ def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP
         else bodies.B_D @ bodies.lift * load_factor,
         G=rows.B,
         h=rows.c / bodies.length,
-        lb=np.full(n, -np.inf),
-        ub=np.full(n, np.inf),
     )

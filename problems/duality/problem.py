@@ -21,7 +21,6 @@ from mortarbench.harness import QP, Friction, Solution, Vector
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
-    ContactSides,
     UnassembledBodies,
     assemble_stiffness,
     factorise_clamped,
@@ -37,10 +36,8 @@ from mortarbench.problems.contact.stepping import Forces, Stage, forces_of
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import (
-    HalfDisc,
     Mesh,
     Nodes,
-    StructuredGrid,
     join,
 )
 
@@ -83,64 +80,13 @@ class Shape(ABC):
         """Contact sides by name: chains of nodes in 2D, faces in 3D."""
         return self.mesh.boundaries
 
-    def _labelled(self, labels: Sequence[NDArray[np.int64]]) -> Subdivision:
-        """Return the subdivision with the labels (E,) of the cells of each body."""
-        from mortarbench.problems.feti.subdivision import Subdivision
-        from mortarbench.problems.feti.tearing import joined_labels
-
-        return Subdivision(self.mesh, joined_labels(labels), self.body)
-
 
 @dataclass(frozen=True, eq=False)
-class StructuredGrids(Shape):
-    """Structured grids; subdomains have at most size² cells."""
+class Structured(Shape):
+    """Structured meshes: plane grids, half discs or boxes of hexahedra."""
 
-    parts: tuple[StructuredGrid, ...]
-
-    @cached_property
-    def joined(self) -> tuple[Mesh, Nodes]:
-        """Joined mesh of all bodies, m, and the body (E,) of each cell."""
-        return join(tuple(part.mesh() for part in self.parts))
-
-    def layout(self, size: int) -> Subdivision:
-        """Cut each grid into blocks of at most `size` cells per side."""
-        from mortarbench.problems.feti.structured import grids_in_blocks
-
-        return grids_in_blocks(self.parts, size, self.joined)
-
-
-@dataclass(frozen=True, eq=False)
-class HalfDiscs(Shape):
-    """Half discs; subdomains are blocks of cells between rings and radii."""
-
-    parts: tuple[HalfDisc, ...]
-
-    @cached_property
-    def joined(self) -> tuple[Mesh, Nodes]:
-        """Joined mesh of all bodies, m, and the body (E,) of each cell."""
-        return join(tuple(part.mesh() for part in self.parts))
-
-    def layout(self, size: int) -> Subdivision:
-        """Cut each half disc into compact blocks of at most size² cells.
-
-        The cuts keep the aspect ratios of blocks near 1. The triangles at the centre
-        count as the last ring of cells.
-        """
-        from mortarbench.problems.feti.tearing import compact_blocks, label_blocks
-
-        blocks = (compact_blocks(disc.lengths(), size) for disc in self.parts)
-        return self._labelled([label_blocks(cut) for cut in blocks])
-
-
-@dataclass(frozen=True, eq=False)
-class StructuredSolids(Shape):
-    """Boxes of hexahedra, possibly deformed; subdomains are compact blocks of cells."""
-
-    #: one mesh per body, numbered as in `problems.fem.mesh.box`; the names of all
-    #: boundaries are distinct
+    #: one mesh per body; the names of all boundaries are distinct
     parts: tuple[Mesh, ...]
-    #: numbers of cells of each box along x, y and z
-    divisions: tuple[tuple[int, int, int], ...]
 
     @cached_property
     def joined(self) -> tuple[Mesh, Nodes]:
@@ -148,16 +94,13 @@ class StructuredSolids(Shape):
         return join(self.parts)
 
     def layout(self, size: int) -> Subdivision:
-        """Cut each box into compact blocks of at most `size` cells per side."""
-        from mortarbench.problems.feti.tearing import compact_boxes
+        """Cut the bodies into blocks of at most `size` cells per side.
 
-        grids = zip(self.parts, self.divisions, strict=True)
-        return self._labelled(
-            [
-                compact_boxes(mesh.points.reshape(z + 1, y + 1, x + 1, 3), size)
-                for mesh, (x, y, z) in grids
-            ]
-        )
+        Blocks of half discs and of boxes are compact.
+        """
+        from mortarbench.problems.feti.structured import blocks_of_meshes
+
+        return blocks_of_meshes(self.parts, size, self.joined)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +117,11 @@ class Meshed(Shape):
     def layout(self, size: int) -> Subdivision:
         """Cut the bodies into `size` subdomains by graph partitioning."""
         from mortarbench.problems.feti.partition import graph_partition
+        from mortarbench.problems.feti.subdivision import Subdivision
 
         mesh, body = self.joined
-        return self._labelled([graph_partition(mesh.points, mesh.cells, body, size)])
+        label = graph_partition(mesh.points, mesh.cells, body, size)
+        return Subdivision(mesh, label, body)
 
 
 #: fields that `ElasticBodies` and `UnassembledBodies` have in common
@@ -294,9 +239,7 @@ class ContactProblem:
     stages: tuple[Stage, ...]
     #: function of the bodies (or their contact sides) and the friction laws of their
     #: pairs; it returns a function that maps a displacement in m to contact rows
-    linearise: Callable[
-        [UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise
-    ]
+    linearise: Callable[[UnassembledBodies, Sequence[FrictionLaw]], Linearise]
     #: normal force per slave node for the first friction bound of Coulomb's law
     initial_force: float = 0.0
     #: function that evaluates quantities beyond those common to all elastic bodies
@@ -316,6 +259,6 @@ class Choice(NamedTuple):
 
 def keyed_linearisation(
     contact: str, basis: str
-) -> Callable[[UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise]:
+) -> Callable[[UnassembledBodies, Sequence[FrictionLaw]], Linearise]:
     """Return the linearisation that the keys `contact` and `basis` select."""
     return lambda bodies, laws: linearisation(bodies, contact, basis, laws)

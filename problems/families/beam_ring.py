@@ -35,22 +35,20 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
     Shape,
-    StructuredGrids,
-    StructuredSolids,
+    Structured,
     keyed_linearisation,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
     Nodes,
-    StructuredGrid,
     as_vectors,
     dofs_of,
     extruded,
-    half_ring_grid,
+    half_ring,
     nodal_lengths,
     nodes_of_side,
-    rectangle_grid,
+    rectangle,
 )
 from mortarbench.problems.keys import (
     CONTACT_FORMS,
@@ -184,13 +182,13 @@ def bodies(
     depth : number of layers across the thickness; 0 for plane bodies
     sides : condition on the end faces in 3D, "free" or "plane-strain"
     """
-    grids = _grids(Nr, Nh, radial)
-    shape: Shape = StructuredGrids(grids)
+    parts = [
+        rectangle((0.0, 0.5), (LENGTH, 0.25), (8 * Nr, Nr)),
+        half_ring((1.0, 0.0), (0.3, 0.49), (12 * Nh, radial)),
+    ]
     if depth:
-        solids = [extruded(grid.mesh(), depth, THICKNESS) for grid in grids]
-        shape = StructuredSolids(
-            tuple(solids), tuple((*grid.divisions, depth) for grid in grids)
-        )
+        parts = [extruded(part, depth, THICKNESS) for part in parts]
+    shape = Structured(tuple(parts))
     by_name = shape.sides
     # in 2D, these are m_E = 2(Nr + 1) + 4(radial + 1) components
     clamped = [
@@ -219,13 +217,6 @@ def bodies(
 def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
     """Mesh and assemble the beam and the ring."""
     return bodies(Nr, Nh, radial, plane).assembled
-
-
-def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGrid]:
-    return (
-        rectangle_grid((0.0, 0.5), (LENGTH, 0.25), (8 * Nr, Nr)),
-        half_ring_grid((1.0, 0.0), (0.3, 0.49), (12 * Nh, radial)),
-    )
 
 
 def _tip(shape: Shape) -> tuple[Nodes, Vector]:

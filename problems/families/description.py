@@ -101,7 +101,6 @@ from mortarbench.harness.errors import shown, unknown
 from mortarbench.harness.files.reading import read_toml
 from mortarbench.problems.contact.bodies import (
     ContactPair,
-    ContactSides,
     UnassembledBodies,
     spring_rows,
     support_rows,
@@ -608,13 +607,18 @@ def _adjusted(
             continue
         with located(f"contacts[{i}]"):
             distance = physical("adjust", checked.positive("adjust", entry["adjust"]))
-            sides = ContactSides(
-                mesh=Mesh(points, named.cells, {}),
-                body_of_node=np.zeros(len(points), dtype=np.int64),
+            mesh = Mesh(points, named.cells, {})
+            sides = UnassembledBodies(
+                mesh=mesh,
+                body=np.zeros(len(named.cells), dtype=np.int64),
                 names=("",),
-                pairs=(pair,),
+                materials=(),
+                plane=None,
                 length=1.0,
                 force=1.0,
+                f=np.zeros(mesh.dofs),
+                B_D=support_rows(mesh, np.zeros(0, dtype=np.int64)),
+                pairs=(pair,),
             )
             rows = linearisation(sides, "nts", None)(np.zeros(points.size))
             near = np.abs(rows.c) <= distance

@@ -52,7 +52,6 @@ from mortarbench.problems.duality.feti_dual import (
     feti_dual,
     feti_matrices,
 )
-from mortarbench.problems.duality.problem import StructuredGrids, StructuredSolids
 from mortarbench.problems.fem.elasticity import (
     Material,
     Plane,
@@ -70,21 +69,20 @@ from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
-    StructuredGrid,
     as_vectors,
     box,
+    cells_of_block,
     dofs_of,
     join,
-    nodal_areas,
-    nodal_lengths,
+    nodal_sizes,
     nodes_of_side,
-    rectangle_grid,
+    prefixed,
+    rectangle,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.spectrum import Spectrum, spectra
-from mortarbench.problems.feti.structured import grids_in_blocks
 from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
@@ -92,7 +90,7 @@ from mortarbench.problems.feti.subdomains import (
     DecomposedProblem,
     TornBodies,
 )
-from mortarbench.problems.feti.tearing import SubdomainMesh, blocks
+from mortarbench.problems.feti.tearing import SubdomainMesh, blocks, joined_labels
 from mortarbench.problems.keys import (
     CONTACT_FORMS,
     MAX_SIZE,
@@ -121,9 +119,10 @@ class DecomposedFamily(Family):
     def in_subdomains(self) -> DecomposedProblem:
         """Return the decomposed problem."""
 
+    @property
     @abstractmethod
-    def primal(self) -> QP:
-        """Return the QP of the undivided problem."""
+    def qp(self) -> QP:
+        """QP of the undivided problem."""
 
     @abstractmethod
     def case(
@@ -140,7 +139,7 @@ class DecomposedFamily(Family):
 
     def undivided(self, form: str) -> Transformed:
         """Return a form of the undivided problem."""
-        return primal_form(self.primal())
+        return primal_form(self.qp)
 
     def build(self, form: str, reference: Reference) -> Case:
         """Return the case in the form `form`."""
@@ -155,9 +154,8 @@ class DecomposedFamily(Family):
 
     def decomposed_case(self, served: Served) -> Case:
         """Return the case of the dual in subdomains on rank 0."""
-        primal = self.primal()
-        new = feti_dual(served, primal)
-        case = self.case(new, torn_mechanics(served, primal.P))
+        new = feti_dual(served, self.qp)
+        case = self.case(new, torn_mechanics(served, self.qp.P))
         sizes = decomposition_quantities(served, new.qp)
         return replace(
             case,
@@ -252,8 +250,9 @@ class Obstacle(DecomposedFamily):
         """Problem on the whole grid."""
         return obstacle_problem(self.dim, self.n, self.shape)
 
-    def primal(self) -> QP:
-        """Return the QP of the undivided problem."""
+    @property
+    def qp(self) -> QP:
+        """QP of the undivided problem."""
         return self.problem.qp
 
     def undivided(self, form: str) -> Transformed:
@@ -272,12 +271,6 @@ class Obstacle(DecomposedFamily):
                 f"feti with form {form} is not built; expected form dual, or no feti"
             )
         return super().build(form, reference)
-
-    def on_ranks(
-        self, form: str
-    ) -> Callable[[Comm, ReferenceOfOperator], CaseOnRanks] | None:
-        """Return a function that builds a membrane on several ranks; None otherwise."""
-        return super().on_ranks(form) if self.dim == 2 else None
 
     def case(
         self,
@@ -306,84 +299,25 @@ class Obstacle(DecomposedFamily):
 
     def in_subdomains(self) -> DecomposedProblem:
         """Return the decomposed problem; every interior node has a contact row."""
-        n, shape = self.n, self.shape
-        layout: Subdivision
-        h = 2 * HALF_WIDTH[shape] / n
-        if self.dim == 1:  # the whole mesh is generated
-            qp, node = self.problem.qp, np.arange(n + 1)
-            segments = np.stack([node[:-1], node[1:]], axis=-1)
-            mesh, body = Mesh(self.problem.x, segments, {}), np.zeros(n, dtype=np.int64)
-            layout = Subdivision(mesh, blocks((n,), self.feti), body)
-            fixed, load = csr_array(qp.A).indices, -qp.q
-            contact = Contact(csr_array(qp.G), qp.h, np.zeros(0))
-        else:
-            grid = _grid(n, shape)
-            layout = grids_in_blocks((grid,), self.feti)
-            fixed = np.unique(np.concatenate([*grid.sides.values()]))
-            free = np.setdiff1d(np.arange(grid.nodes), fixed)
-            psi = obstacle_height(grid.position(free), shape)
-            ends = np.arange(free.size + 1)
-            G = csr_array(
-                (np.full(free.size, -1.0), free, ends), (free.size, grid.nodes)
-            )
-            contact = Contact(G, -psi, np.zeros(0))
-            load = _load(grid, shape, np.arange(grid.nodes))
+        n, dim, qp = self.n, self.dim, self.qp
+        cells = cells_of_block(n + 1, n + 1)
+        if dim == 1:
+            cells = np.stack([np.arange(n), np.arange(1, n + 1)], axis=-1)
+        body = np.zeros(len(cells), dtype=np.int64)
+        label = blocks((n,) * dim, self.feti)
+        layout = Subdivision(Mesh(self.problem.x, cells, {}), label, body)
         return DecomposedProblem(
             layout=layout,
             components=1,
             material=np.zeros(layout.count, dtype=np.int64),
-            assemble_class=partial(membrane_class, h=h),
+            assemble_class=partial(membrane_class, h=2 * HALF_WIDTH[self.shape] / n),
             E=np.ones(1),
-            names=("string" if self.dim == 1 else "membrane",),
-            load=load,
-            fixed=fixed,
-            contact=contact,
+            names=("string" if dim == 1 else "membrane",),
+            load=-qp.q,
+            fixed=csr_array(qp.A).indices,
+            contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)),
             glue=self.glue,
         )
-
-
-def _grid(n: int, shape: str) -> StructuredGrid:
-    """Return the grid of Ω ⊂ ℝ², numbered as in `nodes`, that is, fastest along y."""
-    x = np.linspace(-HALF_WIDTH[shape], HALF_WIDTH[shape], n + 1)
-    points = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1)
-    return StructuredGrid(points, names=("left", "top", "right", "bottom"))
-
-
-def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
-    """Return the nodal forces −q − Kw of `ObstacleProblem` at the nodes `node` (k,).
-
-    On a square, K = K₁ ⊗ M₁ + M₁ ⊗ K₁, with the stiffness K₁ and mass matrix M₁ of
-    linear elements on a line. Kw is zero except at nodes on the boundary and at their
-    neighbours.
-    """
-    n = grid.divisions[0]
-    h, (i, j) = 2 * HALF_WIDTH[shape] / n, np.divmod(node, n + 1)
-
-    def along(k: Nodes, step: int) -> tuple[Vector, Vector]:
-        one = np.ones(k.size)
-        stiff, mass = (-one, one) if step else (_cells_at(k, n), 2 * _cells_at(k, n))
-        return stiff / h, mass * (h / 6)
-
-    f = -OBSTACLE_LOAD[shape] * _hat_integrals(n, h, node)
-    for a, b in np.ndindex(3, 3):
-        beside = np.stack([i + a - 1, j + b - 1])
-        at_boundary = ((beside == 0) | (beside == n)).any(axis=0)
-        k = np.flatnonzero(at_boundary & ((beside >= 0) & (beside <= n)).all(axis=0))
-        (K_i, M_i), (K_j, M_j) = along(i[k], a - 1), along(j[k], b - 1)
-        w = exact_height(grid.position(beside[0, k] * (n + 1) + beside[1, k]), shape)
-        f[k] -= (K_i * M_j + M_i * K_j) * w
-    return np.asarray(f)
-
-
-def _cells_at(line: Nodes, n: int) -> Vector:
-    """Return the number of cells adjacent to each point (k,) of a line of n cells."""
-    return np.where((line == 0) | (line == n), 1.0, 2.0)
-
-
-def _hat_integrals(n: int, h: float, node: Nodes) -> Vector:
-    """Return ∫N_j of the nodes `node` (k,) of a grid of n × n cells with side h."""
-    i, j = np.divmod(node, n + 1)
-    return np.asarray((h / 2) ** 2 * _cells_at(i, n) * _cells_at(j, n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,16 +354,14 @@ class ObstacleProblem:
 def obstacle_problem(dim: int, n: int, shape: str = "flat") -> ObstacleProblem:
     """Assemble the problem on a uniform grid with n cells per side."""
     h = 2 * HALF_WIDTH[shape] / n
-    ends = np.array([1.0] + [2.0] * (n - 1) + [1.0])
     K = grid_stiffness((n,) * dim, h)
-    share: Vector = h / 2 * ends  # ∫N
-    if dim == 2:
-        share = np.outer(share, share).ravel()
+    along = n * h * hat_integrals(n, 0.0, 1.0)  # ∫N on a line
+    share = along if dim == 1 else np.outer(along, along).ravel()
     x = nodes(dim, n, shape)
     # subtract half a cell, because coordinates are rounded
     at_boundary = np.abs(x).max(axis=1) > HALF_WIDTH[shape] - h / 2
     w = np.where(at_boundary, exact_height(x, shape), 0.0)
-    one, N = csr_array(eye_array(len(x))), len(x)
+    one = csr_array(eye_array(len(x)))
     qp = QP(
         P=K,
         q=OBSTACLE_LOAD[shape] * share + K @ w,
@@ -437,8 +369,6 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> ObstacleProblem:
         b=np.zeros(at_boundary.sum()),
         G=-one[~at_boundary],
         h=-obstacle_height(x[~at_boundary], shape),
-        lb=np.full(N, -np.inf),
-        ub=np.full(N, np.inf),
     )
     return ObstacleProblem(shape, x, n**dim, w, qp)
 
@@ -446,17 +376,12 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> ObstacleProblem:
 def bound_form(rows: QP) -> Transformed:
     """Eliminate the prescribed components, and replace −v ≤ −ψ by bounds v ≥ ψ."""
     free = csr_array(rows.G).indices
-    n, m = rows.q.size, free.size
+    n = rows.q.size
     K = csc_array(rows.P)
     qp = QP(
         P=K[free][:, free],
         q=rows.q[free],
-        A=no_rows(m),
-        b=np.zeros(0),
-        G=no_rows(m),
-        h=np.zeros(0),
         lb=-rows.h,
-        ub=np.full(m, np.inf),
     )
 
     def recover(s: Solution) -> Solution:
@@ -610,31 +535,22 @@ class Membranes(DecomposedFamily):
         return self.S * self.n
 
     @cached_property
-    def _joined(self) -> tuple[Mesh, Nodes]:
-        return join(tuple(grid.mesh() for grid in self.grids))
+    def joined(self) -> tuple[Mesh, Nodes]:
+        """Mesh of both squares, and the membrane (E,) of each cell.
 
-    @property
-    def grids(self) -> tuple[StructuredGrid, ...]:
-        """Grids of the two adjacent squares, the left one first."""
-        return tuple(
-            rectangle_grid((x, 0.0), (1.0, 1.0), (self.side,) * 2).prefixed(f"{name} ")
+        Nodes on the common edge are duplicated.
+        """
+        squares = (
+            prefixed(rectangle((x, 0.0), (1.0, 1.0), (self.side,) * 2), f"{name} ")
             for x, name in zip((0.0, 1.0), MEMBRANES, strict=True)
         )
-
-    @property
-    def mesh(self) -> Mesh:
-        """Mesh of both squares; nodes on the common edge are duplicated."""
-        return self._joined[0]
-
-    @property
-    def body(self) -> Nodes:
-        """Index of the membrane of each cell, (E,)."""
-        return self._joined[1]
+        return join(tuple(squares))
 
     @cached_property
     def qp(self) -> QP:
         """Primal problem for the heights u of the nodes."""
-        nodes, sides = len(self.mesh.points), self.mesh.boundaries
+        mesh = self.joined[0]
+        nodes, sides = len(mesh.points), mesh.boundaries
         K = grid_stiffness((self.side, self.side))
         one = csr_array(eye_array(nodes, format="csr"))
         A, G = one[np.sort(sides["left left"])], _contact_rows(sides, nodes)
@@ -645,8 +561,6 @@ class Membranes(DecomposedFamily):
             b=np.zeros(A.shape[0]),
             G=G,
             h=np.zeros(G.shape[0]),
-            lb=np.full(nodes, -np.inf),
-            ub=np.full(nodes, np.inf),
         )
 
     def load(self, node: Nodes) -> Vector:
@@ -658,14 +572,11 @@ class Membranes(DecomposedFamily):
         along = hat_integrals(self.side, 0.0, 1.0)
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
-    def primal(self) -> QP:
-        """Return the QP of the undivided membranes."""
-        return self.qp
-
     def in_subdomains(self) -> DecomposedProblem:
         """Return the decomposed problem of both membranes."""
-        layout = grids_in_blocks(self.grids, self.n, self._joined)
-        sides = self.mesh.boundaries
+        mesh, body = self.joined
+        label = joined_labels([blocks((self.side,) * 2, self.n)] * 2)
+        layout, sides = Subdivision(mesh, label, body), mesh.boundaries
         G = _contact_rows(sides, layout.nodes)
         return DecomposedProblem(
             layout=layout,
@@ -870,19 +781,16 @@ class Plate(DecomposedFamily):
         return np.stack([elasticity_matrix(m, self.state) for m in materials])
 
     @cached_property
-    def shape(self) -> StructuredGrids | StructuredSolids:
-        """Geometry of the undivided plate."""
-        if self.dim == 3:
-            x, y, z = self.divisions
-            mesh = box((0.0,) * 3, self.size, self.divisions)
-            return StructuredSolids((mesh,), ((x, y, z),))
-        (width, height), (nx, ny) = self.size, self.divisions
-        return StructuredGrids((rectangle_grid((0.0, 0.0), (width, height), (nx, ny)),))
+    def mesh(self) -> Mesh:
+        """Mesh of the undivided plate."""
+        build: Any = rectangle if self.dim == 2 else box
+        mesh: Mesh = build((0.0,) * self.dim, self.size, self.divisions)
+        return mesh
 
     @property
     def clamped(self) -> Nodes:
         """Displacement components of the nodes on the clamped side."""
-        return dofs_of(nodes_of_side(self.shape.sides["left"]), self.dim)
+        return dofs_of(nodes_of_side(self.mesh.boundaries["left"]), self.dim)
 
     @cached_property
     def material(self) -> NDArray[np.int64]:
@@ -893,7 +801,7 @@ class Plate(DecomposedFamily):
     @cached_property
     def qp(self) -> QP:
         """Primal problem of the undivided plate."""
-        mesh = self.shape.mesh
+        mesh = self.mesh
         n = mesh.dofs
         one = csr_array(eye_array(n, format="csr"))
         return QP(
@@ -901,19 +809,11 @@ class Plate(DecomposedFamily):
             q=-self.in_subdomains().load,
             A=one[self.clamped],
             b=np.zeros(self.clamped.size),
-            G=no_rows(n),
-            h=np.zeros(0),
-            lb=np.full(n, -np.inf),
-            ub=np.full(n, np.inf),
         )
-
-    def primal(self) -> QP:
-        """Return the QP of the undivided plate."""
-        return self.qp
 
     def factorise(self) -> GeneralisedInverse:
         """Factorise K without the prescribed components."""
-        free = np.setdiff1d(np.arange(self.shape.mesh.dofs), self.clamped)
+        free = np.setdiff1d(np.arange(self.mesh.dofs), self.clamped)
         return regular_inverse(self.qp.P, free)
 
     def von_mises(self, u: Vector) -> Vector:
@@ -921,7 +821,7 @@ class Plate(DecomposedFamily):
 
         A node between two materials has one value, although the stress jumps there.
         """
-        mesh, D = self.shape.mesh, self.D[self.material] * (PLATE_LOAD / PLATE_LENGTH)
+        mesh, D = self.mesh, self.D[self.material] * (PLATE_LOAD / PLATE_LENGTH)
         stress = recover(mesh, centre_stress(mesh, D, u))
         return von_mises(stress, STEEL.nu, self.state)
 
@@ -941,7 +841,7 @@ class Plate(DecomposedFamily):
         subdomains: Callable[[], DecomposedMechanics] | None = None,
     ) -> Case:
         """Return the case of a form of the problem."""
-        mesh, unit = self.shape.mesh, PLATE_LOAD * PLATE_LENGTH
+        mesh, unit = self.mesh, PLATE_LOAD * PLATE_LENGTH
         cells = len(mesh.cells)
         return Case(
             qp=new.qp,
@@ -973,7 +873,7 @@ class Plate(DecomposedFamily):
 
         The tip is the corner with the largest coordinates.
         """
-        mesh = self.shape.mesh
+        mesh = self.mesh
         tip = dofs_of(np.array([len(mesh.points) - 1]), mesh.dim)
         return {
             "nodes": len(mesh.points),
@@ -986,8 +886,9 @@ class Plate(DecomposedFamily):
 
     def in_subdomains(self) -> DecomposedProblem:
         """Return the decomposed problem: a contact problem without contact rows."""
-        shape, none = self.shape, np.zeros(0)
-        layout = _layout(shape, self.side)
+        mesh, none = self.mesh, np.zeros(0)
+        body = np.zeros(len(mesh.cells), dtype=np.int64)
+        layout = Subdivision(mesh, blocks(self.divisions, self.side), body)
         return DecomposedProblem(
             layout=layout,
             components=self.dim,
@@ -996,20 +897,11 @@ class Plate(DecomposedFamily):
             glue=self.glue,
             material=_pattern(self),
             assemble_class=partial(elastic_class, D=self.D, E=self.moduli),
-            load=_pull(layout, shape.sides["right"], self.load).on(shape.mesh.dofs),
+            load=_pull(mesh, self.load).on(mesh.dofs),
             fixed=self.clamped,
             eliminated=self.supports == "eliminated",
             contact=Contact(no_rows(self.dim * layout.nodes), none, none),
         )
-
-
-def _layout(
-    shape: StructuredGrids | StructuredSolids, side: tuple[int, ...]
-) -> Subdivision:
-    """Cut the plate into subdomains of `side` cells along the axes."""
-    if isinstance(shape, StructuredGrids):
-        return grids_in_blocks(shape.parts, side, shape.joined)
-    return Subdivision(shape.mesh, blocks(shape.divisions[0], side), shape.body)
 
 
 def _pattern(plate: Plate) -> NDArray[np.int64]:
@@ -1024,20 +916,14 @@ def _pattern(plate: Plate) -> NDArray[np.int64]:
     return patterns[plate.pattern]
 
 
-def _pull(layout: Subdivision, side: Nodes, kind: str) -> Forces:
-    """Return the load, distributed over a side according to the key `load`."""
-    nodes = nodes_of_side(side)
-    points = layout.mesh.points[nodes]
-    dim = points.shape[1]
+def _pull(mesh: Mesh, kind: str) -> Forces:
+    """Return the load, distributed over the right side by the key `load`."""
+    nodes, share = nodal_sizes(mesh.points, mesh.boundaries["right"])
     if kind == "point":
         share = (nodes == nodes.max()).astype(float)
     elif kind == "nodal":
         share = np.ones(nodes.size)
-    elif dim == 3:
-        share = nodal_areas(points, np.searchsorted(nodes, side))[1]
-    else:
-        share = nodal_lengths(points)
-    return Forces(dofs_of(nodes, dim, dim - 1), -share / share.sum())
+    return Forces(dofs_of(nodes, mesh.dim, mesh.dim - 1), -share / share.sum())
 
 
 def dual_quantities(moduli: Vector, qp: QP, B: csr_array) -> dict[str, Any]:

@@ -18,7 +18,7 @@ u_z = 0; the solution in every layer of nodes is therefore that of plane strain.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -36,18 +36,16 @@ from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
-    StructuredGrids,
-    StructuredSolids,
+    Structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import (
-    Nodes,
     box,
     dofs_of,
-    nodal_areas,
-    nodal_lengths,
-    rectangle_grid,
+    nodal_sizes,
+    nodes_of_side,
+    rectangle,
 )
 from mortarbench.problems.keys import (
     CONTACT_FORMS,
@@ -93,25 +91,35 @@ class Greco(ContactFamily):
     def problem(self) -> ContactProblem:
         """Return the problem of the plate with n × n cells, or n × n × depth in 3D."""
         dim, n = self.dim, self.n
-        body = plate(n) if dim == 2 else extruded_plate(n, self.depth)
-        unit = FORCE * body.thickness
-        (top, top_shares), (left, left_shares) = body.top, body.left
+        none, thickness = np.zeros(0, dtype=np.int64), 1.0
+        mesh = rectangle((0.0, 0.0), (SIDE, SIDE), (n, n))
+        names, ends = ("bottom", "top"), none
+        if dim == 3:
+            thickness, names = SIDE * self.depth / n, ("front", "back")
+            mesh = box((0.0,) * 3, (SIDE, SIDE, thickness), (n, n, self.depth))
+            ends = np.unique([mesh.boundaries["bottom"], mesh.boundaries["top"]])
+        sides, points, unit = mesh.boundaries, mesh.points, FORCE * thickness
+        ground, right = sides[names[0]], nodes_of_side(sides["right"])
+        top, top_shares = nodal_sizes(points, sides[names[1]])
+        left, left_shares = nodal_sizes(points, sides["left"])
         forces = Forces(
             np.concatenate([dofs_of(top, dim, 1), dofs_of(left, dim, 0)]),
             np.concatenate([-TOP * top_shares / unit, LEFT * left_shares / unit]),
         )
         fixed = np.concatenate(
             [
-                dofs_of(body.right, dim, 0),
-                dofs_of(body.corner, dim, 1),
-                dofs_of(body.ends, dim, dim - 1),
+                dofs_of(right, dim, 0),
+                dofs_of(np.intersect1d(ground, right), dim, 1),
+                dofs_of(ends, dim, dim - 1),
             ]
         )
+        if dim == 2:
+            ground = ground[:-1]  # the corner has no contact row
         rigid = RigidPlane((0.0,) * dim, (0.0, 1.0, 0.0)[:dim])
-        on_rigid = ContactPair(body.ground, body.ground[:0], rigid)
+        on_rigid = ContactPair(ground, ground[:0], rigid)
         return ContactProblem(
             bodies=ElasticBodies(
-                shape=body.shape,
+                shape=Structured((mesh,)),
                 names=("plate",),
                 materials=(MATERIAL,),
                 plane="strain" if dim == 2 else None,
@@ -126,63 +134,10 @@ class Greco(ContactFamily):
             ),
             linearise=lambda bodies, laws: linearisation(bodies, "nts", "dual", laws),
             results=lambda answer: {
-                **published_quantities(*answer.sides, thickness=body.thickness),
+                **published_quantities(*answer.sides, thickness=thickness),
                 "tresca_problems": answer.problems,
             },
         )
-
-
-class Plate(NamedTuple):
-    """Plate with the nodes of its sides, and nodal lengths (areas) of loaded sides."""
-
-    shape: StructuredGrids | StructuredSolids
-    ground: Nodes  #: contact side y = 0, in 2D without its node on x = 40 mm
-    top: tuple[Nodes, Vector]  #: nodes of y = 40 mm and nodal lengths, m (areas, m²)
-    left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths, m (areas, m²)
-    right: Nodes  #: nodes of x = 40 mm
-    corner: Nodes  #: nodes of x = 40 mm, y = 0
-    ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in 2D
-    thickness: float  #: thickness, m; 1 in 2D
-
-
-def plate(n: int) -> Plate:
-    """Return the plate with n × n quadrilaterals."""
-    grid = rectangle_grid((0.0, 0.0), (SIDE, SIDE), (n, n))
-    sides = grid.sides
-    top, left = (
-        (sides[name], nodal_lengths(grid.position(sides[name])))
-        for name in ("top", "left")
-    )
-    corner = sides["bottom"][-1:]
-    return Plate(
-        shape=StructuredGrids((grid,)),
-        ground=sides["bottom"][:-1],
-        top=top,
-        left=left,
-        right=sides["right"],
-        corner=corner,
-        ends=np.zeros(0, dtype=np.int64),
-        thickness=1.0,
-    )
-
-
-def extruded_plate(n: int, depth: int) -> Plate:
-    """Return the plate with n × n × depth cubes between its end faces."""
-    thickness, divisions = SIDE * depth / n, (n, n, depth)
-    mesh = box((0.0, 0.0, 0.0), (SIDE, SIDE, thickness), divisions)
-    sides = mesh.boundaries
-    ground, right = sides["front"], np.unique(sides["right"])
-    top, left = (nodal_areas(mesh.points, sides[name]) for name in ("back", "left"))
-    return Plate(
-        shape=StructuredSolids((mesh,), (divisions,)),
-        ground=ground,
-        top=top,
-        left=left,
-        right=right,
-        corner=np.intersect1d(ground, right),
-        ends=np.unique(np.concatenate([sides["bottom"], sides["top"]])),
-        thickness=thickness,
-    )
 
 
 def published_quantities(

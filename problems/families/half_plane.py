@@ -49,7 +49,6 @@ from mortarbench.harness import (
     Reference,
     Solution,
     Vector,
-    no_rows,
 )
 from mortarbench.harness.keys import DERIVED, Range
 from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
@@ -304,8 +303,6 @@ def _dual(F: Matrix, gap: Vector, force: float, lower: Vector, upper: Vector) ->
         q=gap,
         A=np.ones((1, n)),
         b=np.array([force]),
-        G=no_rows(n),
-        h=np.zeros(0),
         lb=lower,
         ub=upper,
     )

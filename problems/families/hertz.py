@@ -44,7 +44,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,6 @@ from mortarbench.harness import (
 from mortarbench.harness.keys import DERIVED, Range
 from mortarbench.problems.contact.bodies import (
     ContactPair,
-    ContactSides,
     UnassembledBodies,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
@@ -76,19 +75,21 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
     ElasticBodies,
-    HalfDiscs,
     Linearise,
+    Shape,
+    Structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.families.line_contact import LineContact, TangentialContact
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
-    HalfDisc,
+    Mesh,
     Nodes,
     as_vectors,
     dofs_of,
-    joined_sides,
+    half_disc,
     nodal_lengths,
+    prefixed,
 )
 from mortarbench.problems.keys import (
     POSITIVE,
@@ -252,7 +253,7 @@ class HertzCylinder(ContactFamily):
         )
 
         def linearise(
-            bodies: UnassembledBodies | ContactSides, laws: Sequence[FrictionLaw]
+            bodies: UnassembledBodies, laws: Sequence[FrictionLaw]
         ) -> Linearise:
             rows = linearisation(bodies, self.contact, self.basis, laws)
             return lambda u: rows(np.zeros_like(u))
@@ -287,7 +288,7 @@ def _cylinder_on_plane(
         keys.load * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, keys.plane)
     )
     a = min(exact.a, RADIUS)  # see `half_cylinders`
-    shape = HalfDiscs((_half_cylinder(RADIUS, a / keys.n, a, keys.halvings),))
+    shape = Structured((_half_cylinder(RADIUS, a / keys.n, a, keys.halvings),))
     sides = shape.sides
     return ElasticBodies(
         shape=shape,
@@ -297,17 +298,9 @@ def _cylinder_on_plane(
         length=RADIUS,
         force=exact.P,
         fixed=_on_axis(sides),
-        forces=_pressing(shape.parts, "flat", 1.0),
+        forces=_pressing(shape, "flat", 1.0),
         pairs=(ContactPair(sides["arc"], sides["arc"][:0], GROUND),),
     ), exact
-
-
-class HalfCylinders(NamedTuple):
-    """Two half cylinders that touch at (0, 0), and Hertz's solution."""
-
-    discs: tuple[HalfDisc, ...]
-    materials: tuple[Material, ...]
-    exact: LineContact
 
 
 def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]:
@@ -319,17 +312,17 @@ def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]
     would resist. Slip in the next stage would then be measured from an arbitrary state,
     and the rolling would contribute to the work of Q.
     """
-    discs, sides = half_cylinders(keys).discs, elastic.shape.sides
+    shape = elastic.shape
     pressing = [
-        _pressing(discs, "upper_flat", 1.0),
-        _pressing(discs, "lower_flat", -1.0),
+        _pressing(shape, "upper_flat", 1.0),
+        _pressing(shape, "lower_flat", -1.0),
     ]
     loads = _loads(keys)
     quasi_static = keys.loading == "quasi-static"
 
     def acting(P: float, Q: float) -> Forces:
         forces = [Forces(at, P * value) for at, value in pressing]
-        return _summed(forces + (_shearing(discs, Q * keys.mu) if Q else []))
+        return _summed(forces + (_shearing(shape, Q * keys.mu) if Q else []))
 
     def begin(k: int, end: State) -> State:
         """Return the initial state of a stage, with normal forces in proportion to P.
@@ -343,7 +336,7 @@ def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]
         slip = u if quasi_static else np.zeros_like(u)
         return State(u, slip, loads[k][0] / previous * end.normal_forces)
 
-    fixed = np.append(elastic.fixed, _on_axis(sides, "upper_"))
+    fixed = np.append(elastic.fixed, _on_axis(shape.sides, "upper_"))
     first = Stage(step=1, part=1.0, forces=acting(loads[0][0], 0.0), fixed=fixed)
     return first, *(
         Stage(
@@ -358,58 +351,47 @@ def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]
     )
 
 
-def half_cylinders(keys: HertzCylinder) -> HalfCylinders:
-    """Return the cylinders, with n (upper) and m (lower) cells per half width a.
-
-    Both cylinders have R = 8 mm. The upper one has E = 200 GPa; the modulus of the
-    lower one is multiplied by `ratio`. If Hertz's a exceeds R, because the bodies are
-    too soft for the theory, the mesh is that for a = R, so that the uniform part of the
-    arc does not exceed the half disc.
-    """
-    lower_material = Material(keys.ratio * MATERIAL.E, MATERIAL.nu)
-    compliance = _compliance(MATERIAL, keys.plane)
-    compliance += _compliance(lower_material, keys.plane)
-    exact = LineContact(keys.load * UNIT_LOAD, RADIUS / 2, 1 / compliance)
-    a, halvings = min(exact.a, RADIUS), keys.halvings
-    upper = _half_cylinder(RADIUS, a / keys.n, a, halvings).prefixed("upper_")
-    lower = _half_cylinder(-RADIUS, a / keys.m, a, halvings).prefixed("lower_")
-    return HalfCylinders((upper, lower), (MATERIAL, lower_material), exact)
-
-
 def two_cylinders(keys: HertzCylinder) -> tuple[ElasticBodies, LineContact]:
     """Return the cylinders in contact under P alone, and Hertz's solution.
+
+    Both cylinders have R = 8 mm, and touch at (0, 0). There are n (upper) and m (lower)
+    cells per half width a. The upper cylinder has E = 200 GPa; the modulus of the lower
+    one is multiplied by `ratio`. If Hertz's a exceeds R, because the bodies are too
+    soft for the theory, the mesh is that for a = R, so that the uniform part of the arc
+    does not exceed the half disc.
 
     With a tangential force, the supports only exclude rigid motions and have no
     reactions. Without a tangential force, the supports also enforce the symmetry about
     the axis.
     """
-    halves = half_cylinders(keys)
-    discs, exact, shape = halves.discs, halves.exact, HalfDiscs(halves.discs)
+    materials = MATERIAL, Material(keys.ratio * MATERIAL.E, MATERIAL.nu)
+    compliance = sum(_compliance(material, keys.plane) for material in materials)
+    exact = LineContact(keys.load * UNIT_LOAD, RADIUS / 2, 1 / compliance)
+    a, halvings = min(exact.a, RADIUS), keys.halvings
+    upper = _half_cylinder(RADIUS, a / keys.n, a, halvings)
+    lower = _half_cylinder(-RADIUS, a / keys.m, a, halvings)
+    shape = Structured((prefixed(upper, "upper_"), prefixed(lower, "lower_")))
     sides, flat = shape.sides, shape.sides["lower_flat"]
-    forces = [_pressing(discs, "upper_flat", 1.0)]
-    on_axis = _on_axis(sides, "lower_")
+    forces, on_axis = [_pressing(shape, "upper_flat", 1.0)], _on_axis(sides, "lower_")
     if keys.peak:
-        forces.append(_pressing(discs, "lower_flat", -1.0))
+        forces.append(_pressing(shape, "lower_flat", -1.0))
         fixed = np.append(on_axis, dofs_of(flat[flat.size // 2], 2, 1))
     else:
-        upper = _on_axis(sides, "upper_")
-        fixed = np.concatenate([upper, on_axis, dofs_of(flat, 2, 1)])
+        fixed = np.concatenate(
+            [_on_axis(sides, "upper_"), on_axis, dofs_of(flat, 2, 1)]
+        )
+    arcs = sides["upper_arc"], sides["lower_arc"]
     return ElasticBodies(
         shape=shape,
         names=NAMES,
-        materials=halves.materials,
+        materials=materials,
         plane=keys.plane,
         length=RADIUS,
         force=exact.P,
         fixed=fixed,
         forces=_summed(forces),
-        pairs=(_pair(keys, sides),),
+        pairs=(ContactPair(*(arcs if keys.slave == "upper" else arcs[::-1])),),
     ), exact
-
-
-def _pair(keys: HertzCylinder, sides: Mapping[str, Nodes]) -> ContactPair:
-    upper, lower = sides["upper_arc"], sides["lower_arc"]
-    return ContactPair(*((upper, lower) if keys.slave == "upper" else (lower, upper)))
 
 
 def _shear_forces(points: NDArray[np.float64], Q: float) -> Vector:
@@ -423,16 +405,12 @@ def _shear_forces(points: NDArray[np.float64], Q: float) -> Vector:
     return np.column_stack(forces).ravel()
 
 
-def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[Forces]:
+def _shearing(shape: Shape, Q: float) -> list[Forces]:
     """Return the nodal forces of Q on the upper flat side, and of −Q on the lower."""
-    sides = joined_sides(discs)
-    loads = zip(discs, ("upper_flat", "lower_flat"), (Q, -Q), strict=True)
+    flats = (shape.sides["upper_flat"], Q), (shape.sides["lower_flat"], -Q)
     return [
-        Forces(
-            dofs_of(sides[flat], 2),
-            _shear_forces(disc.position(disc.sides[flat]), part),
-        )
-        for disc, flat, part in loads
+        Forces(dofs_of(flat, 2), _shear_forces(shape.mesh.points[flat], part))
+        for flat, part in flats
     ]
 
 
@@ -461,7 +439,7 @@ def _slip_starts_at_rest(keys: HertzCylinder) -> bool:
     return keys.loading == "static" or keys.programme == "proportional"
 
 
-def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc:
+def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> Mesh:
     """Return the half disc around (0, 0) of a cylinder with centre (0, `centre`).
 
     Cells have size h at (0, 0) and grow along the arc and inwards. All cells are then
@@ -476,7 +454,7 @@ def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc
     )
     angles = towards + np.concatenate([-arc[:0:-1], arc])
     radii = radius - insert_midpoints(graded_points(h, 0.0, radius), halvings)[:-1]
-    return HalfDisc((0.0, centre), angles, radii)
+    return half_disc((0.0, centre), angles, radii)
 
 
 def graded_points(h: float, uniform: float, total: float) -> Vector:
@@ -503,11 +481,11 @@ def insert_midpoints(x: Vector, times: int) -> Vector:
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
 
 
-def _pressing(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
+def _pressing(shape: Shape, flat: str, P: float) -> Forces:
     """Return the nodal forces of a load P along −y, uniform over the side `flat`."""
-    (disc,) = (disc for disc in discs if flat in disc.sides)
-    share = nodal_lengths(disc.position(disc.sides[flat]))
-    return Forces(dofs_of(joined_sides(discs)[flat], 2, 1), -P * share / share.sum())
+    nodes = shape.sides[flat]
+    share = nodal_lengths(shape.mesh.points[nodes])
+    return Forces(dofs_of(nodes, 2, 1), -P * share / share.sum())
 
 
 def pressure_quantities(

@@ -30,7 +30,7 @@ a/R, which changes the results by O(a²/R²).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -41,7 +41,6 @@ from mortarbench.harness import InputError, Vector
 from mortarbench.harness.keys import Range
 from mortarbench.problems.contact.bodies import (
     ContactPair,
-    ContactSides,
     UnassembledBodies,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
@@ -59,7 +58,7 @@ from mortarbench.problems.duality.problem import (
     ContactSolution,
     ElasticBodies,
     Linearise,
-    StructuredSolids,
+    Structured,
     keyed_linearisation,
 )
 from mortarbench.problems.families.contact import ContactFamily
@@ -107,7 +106,6 @@ class _Block(NamedTuple):
     """A block cut from a half space around the contact."""
 
     mesh: Mesh
-    cells: tuple[int, int, int]
     up: int  #: 1 for a block above the plane z = 0, −1 for one below
     copies: int  #: number of blocks around the axis: 4, or 2 of double width
 
@@ -262,20 +260,15 @@ class HertzSphere(ContactFamily):
             }
 
         def linearise(
-            bodies: UnassembledBodies | ContactSides, laws: Sequence[FrictionLaw]
+            bodies: UnassembledBodies, laws: Sequence[FrictionLaw]
         ) -> Linearise:
             rows = keyed_linearisation(self.contact, self.basis)(bodies, laws)
             return lambda u: rows(np.zeros_like(u))
 
-        shape = StructuredSolids(
-            tuple(
-                prefixed(b.mesh, name) for b, name in zip(blocks, names, strict=True)
-            ),
-            tuple(b.cells for b in blocks),
-        )
+        meshes = (prefixed(b.mesh, k) for b, k in zip(blocks, names, strict=True))
         return ContactProblem(
             bodies=ElasticBodies(
-                shape=shape,
+                shape=Structured(tuple(meshes)),
                 names=names,
                 materials=(material,) * len(names),
                 plane=None,
@@ -323,8 +316,7 @@ def _block(a: float, R: float, n: int, up: int, copies: int) -> _Block:
     points = grid.points.copy()
     depth = R - np.sqrt(R**2 - (points[:, :2] ** 2).sum(axis=1))
     points[:, 2] += up * (1 - np.abs(points[:, 2]) / size) * depth
-    cells = x.size - 1, y.size - 1, z.size - 1
-    return _Block(Mesh(points, grid.cells, grid.boundaries), cells, up, copies)
+    return _Block(replace(grid, points=points), up, copies)
 
 
 def _near(block: _Block, half_width: float) -> Nodes:

@@ -51,8 +51,7 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
     ElasticBodies,
-    StructuredGrids,
-    StructuredSolids,
+    Structured,
     keyed_linearisation,
 )
 from mortarbench.problems.families.contact import ContactFamily
@@ -60,16 +59,15 @@ from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.finite_strain import cauchy_stress, strain_energy
 from mortarbench.problems.fem.hyperelastic import Hyperelastic, hyperelastic
 from mortarbench.problems.fem.mesh import (
-    Nodes,
-    StructuredGrid,
+    Mesh,
     as_vectors,
     box,
     distorted,
     dofs_of,
-    nodal_areas,
-    nodal_lengths,
+    nodal_sizes,
+    nodes_of_side,
     prefixed,
-    rectangle_grid,
+    rectangle,
 )
 from mortarbench.problems.fem.stress import gauss_stress
 from mortarbench.problems.keys import (
@@ -309,81 +307,46 @@ def bodies(patch: ContactPatch) -> ElasticBodies:
 
     In 3D, the numbers of cells along y are the same.
     """
-    if patch.dim == 3:
-        return _bodies_in_space(patch)
-    shape = StructuredGrids(_grids(patch))
-    sides, force = shape.sides, PRESSURE * LENGTH
-    left = np.concatenate([sides["lower_left"], sides["upper_left"]])
-    rollers = dofs_of(left, 2, 0), dofs_of(sides["lower_bottom"], 2, 1)
-    pressing = -PRESSURE * nodal_lengths(shape.mesh.points[shape.sides["upper_top"]])
-    return ElasticBodies(
-        shape=shape,
-        names=NAMES,
-        plane=patch.plane,
-        length=LENGTH,
-        force=force,
-        materials=(Material(patch.ratio * E_UPPER, NU), Material(E_UPPER, NU)),
-        fixed=np.concatenate(rollers),
-        pairs=(_pair(patch, sides),),
-        forces=Forces(dofs_of(sides["upper_top"], 2, 1), pressing / force),
-    )
-
-
-def _bodies_in_space(patch: ContactPatch) -> ElasticBodies:
-    """Return two blocks of 1 m × 1 m × ½ m with rollers on x = 0, y = 0 and z = 0."""
-    divisions = [(n, *_divisions(n)) for n in (patch.lower, patch.upper)]
-    meshes = [
-        prefixed(
-            distorted(
-                box((0.0, 0.0, z), (LENGTH, LENGTH, HEIGHT), n), patch.distort, k
-            ),
-            f"{name}_",
-        )
-        for k, (name, z, n) in enumerate(
-            zip(NAMES, (0.0, HEIGHT), divisions, strict=True)
-        )
-    ]
-    shape = StructuredSolids(tuple(meshes), tuple(divisions))
-    sides, force = shape.sides, PRESSURE * LENGTH**2
+    dim, force = patch.dim, PRESSURE * LENGTH ** (patch.dim - 1)
+    shape = Structured(tuple(map(prefixed, _blocks(patch), ("lower_", "upper_"))))
+    sides = shape.sides
+    walls = ("left", "front", "bottom") if dim == 3 else ("left", "bottom")
     rollers = [
-        dofs_of(np.unique(sides[name]), 3, axis)
-        for name, axis in (
-            ("lower_left", 0), ("upper_left", 0), ("lower_front", 1),
-            ("upper_front", 1), ("lower_bottom", 2),
-        )
-    ]  # fmt: skip
-    top, areas = nodal_areas(shape.mesh.points, sides["upper_top"])
+        dofs_of(nodes_of_side(sides[f"{name}_{wall}"]), dim, axis)
+        for axis, wall in enumerate(walls)
+        for name in (NAMES if axis < dim - 1 else NAMES[:1])
+    ]
+    fixed = np.concatenate(rollers)
+    top, sizes = nodal_sizes(shape.mesh.points, sides["upper_top"])
+    lower, upper = sides["lower_top"], sides["upper_bottom"]
+    pair = (lower, upper) if patch.slave == "lower" else (upper, lower)
     return ElasticBodies(
         shape=shape,
         names=NAMES,
-        plane=None,
+        plane=patch.plane if dim == 2 else None,
         length=LENGTH,
         force=force,
         materials=(Material(patch.ratio * E_UPPER, NU), Material(E_UPPER, NU)),
-        fixed=np.unique(np.concatenate(rollers)),
-        pairs=(_pair(patch, sides),),
-        forces=Forces(dofs_of(top, 3, 2), -PRESSURE * areas / force),
+        fixed=np.unique(fixed) if dim == 3 else fixed,
+        pairs=(ContactPair(*pair),),
+        forces=Forces(dofs_of(top, dim, dim - 1), -PRESSURE * sizes / force),
     )
+
+
+def _blocks(patch: ContactPatch) -> list[Mesh]:
+    """Return the lower and the upper block."""
+    meshes = []
+    for k, n in enumerate((patch.lower, patch.upper)):
+        cells, bottom = (n, -(-n // 2)), k * HEIGHT  # cells are nearly square
+        if patch.dim == 2:
+            meshes.append(rectangle((0.0, bottom), (LENGTH, HEIGHT), cells))
+        else:
+            size = LENGTH, LENGTH, HEIGHT
+            block = box((0.0, 0.0, bottom), size, (n, *cells))
+            meshes.append(distorted(block, patch.distort, k))
+    return meshes
 
 
 def model(patch: ContactPatch) -> Bodies:
     """Mesh and assemble the blocks."""
     return bodies(patch).assembled
-
-
-def _pair(patch: ContactPatch, sides: Mapping[str, Nodes]) -> ContactPair:
-    lower, upper = sides["lower_top"], sides["upper_bottom"]
-    return ContactPair(*((lower, upper) if patch.slave == "lower" else (upper, lower)))
-
-
-def _grids(patch: ContactPatch) -> tuple[StructuredGrid, StructuredGrid]:
-    lower, upper = (
-        rectangle_grid((0.0, bottom), (LENGTH, HEIGHT), _divisions(n))
-        for n, bottom in ((patch.lower, 0.0), (patch.upper, HEIGHT))
-    )
-    return lower.prefixed("lower_"), upper.prefixed("upper_")
-
-
-def _divisions(n: int) -> tuple[int, int]:
-    """Return numbers of cells along x and y for which cells are nearly square."""
-    return n, -(-n // 2)

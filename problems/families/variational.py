@@ -24,7 +24,6 @@ from mortarbench.harness import (
     Reference,
     Solution,
     Vector,
-    no_rows,
 )
 from mortarbench.harness.keys import Range
 from mortarbench.problems.keys import POSITIVE, check_memory
@@ -139,10 +138,6 @@ def bounded_case(P: Any, q: Vector, lower: Vector, upper: Vector) -> Case:
     qp = QP(
         P=csc_array(P),
         q=q,
-        A=no_rows(q.size),
-        b=np.zeros(0),
-        G=no_rows(q.size),
-        h=np.zeros(0),
         lb=lower,
         ub=upper,
     )

@@ -112,21 +112,18 @@ INLINED void cell_stiffness(
 
 /* Add the block Ke of a cell to the entries of a matrix in the order of dof_pattern.
 
-   The entry for component k of node i and component l of node j is
-   Ke[i·node_i + k·part_k + j·node_j + l·part_l];
    nodes (n,), ptr and slot (n, n): see problems.fem.elasticity.Pattern */
 INLINED void scatter(
-    int n, int dim, const double *Ke, int node_i, int part_k, int node_j, int part_l,
-    const int *nodes, const int *ptr, const int *slot, double *data
+    int n, int dim, const double *Ke, const int *nodes, const int *ptr, const int *slot,
+    double *data
 ) {
     for (int i = 0; i < n; i++) {
         const ptrdiff_t first = ptr[nodes[i]], row = dim * (ptr[nodes[i] + 1] - first);
         for (int j = 0; j < n; j++) {
             double *to = data + dim * dim * first + dim * slot[i * n + j];
-            const double *from = Ke + i * node_i + j * node_j;
             for (int k = 0; k < dim; k++)
                 for (int l = 0; l < dim; l++)
-                    to[k * row + l] += from[k * part_k + l * part_l];
+                    to[k * row + l] += Ke[((k * dim + l) * n + i) * n + j];
         }
     }
 }
@@ -144,7 +141,7 @@ INLINED void sum_cells(
             for (int m = 0; m < dim; m++)
                 x[i * dim + m] = points[(ptrdiff_t)nodes[i] * dim + m];
         cell_stiffness(n, dim, pairs, elem, x, D + material[e] * v * v, Ke);
-        scatter(n, dim, Ke, n, dim * n * n, 1, n * n, nodes, ptr, slot + e * n * n, data);
+        scatter(n, dim, Ke, nodes, ptr, slot + e * n * n, data);
     }
 }
 
@@ -162,68 +159,4 @@ CLONED static void sum_stiffness(
         sum_cells(4, 3, 1, elem, points, E, cells, D, material, ptr, slot, data);
     else
         sum_cells(n, dim, elem->pairs, elem, points, E, cells, D, material, ptr, slot, data);
-}
-
-/* Sum blocks (E, n·dim, n·dim), whose rows are ordered by node, then by component. */
-static void sum_blocks(
-    int n, int dim, const double *blocks, ptrdiff_t E, const int *cells, const int *ptr,
-    const int *slot, double *data
-) {
-    const int size = n * dim;
-    for (ptrdiff_t e = 0; e < E; e++)
-        if (n == 4 && dim == 2)
-            scatter(4, 2, blocks + e * 64, 16, 8, 2, 1, cells + e * 4, ptr,
-                    slot + e * 16, data);
-        else
-            scatter(n, dim, blocks + e * size * size, dim * size, size, dim, 1,
-                    cells + e * n, ptr, slot + e * n * n, data);
-}
-
-/* Integrate  K_(ai)(bj) = Σ_q v_q ∂N_a/∂X_m A_imjn ∂N_b/∂X_n  of one cell.
-
-   grad (points, n, dim), volumes (points,), A (points, dim, dim, dim, dim), symmetric */
-INLINED void cell_tangent(
-    int n, int dim, int points, const double *grad, const double *volumes,
-    const double *A, double *K
-) {
-    const int size = n * dim, tensor = dim * dim * dim * dim;
-    for (int q = 0; q < points; q++, grad += size, A += tensor)
-        for (int a = 0; a < n; a++)
-            for (int i = 0; i < dim; i++)
-                for (int j = 0; j < dim; j++) {
-                    double left[DIM]; /* Σ_m ∂N_a/∂X_m A_imjk for each k */
-                    for (int k = 0; k < dim; k++) {
-                        double sum = grad[a * dim] * A[((i * dim) * dim + j) * dim + k];
-                        for (int m = 1; m < dim; m++)
-                            sum += grad[a * dim + m]
-                                 * A[((i * dim + m) * dim + j) * dim + k];
-                        left[k] = volumes[q] * sum;
-                    }
-                    for (int b = a; b < n; b++) {
-                        if (b * dim + j < a * dim + i)
-                            continue;
-                        double sum = left[0] * grad[b * dim];
-                        for (int k = 1; k < dim; k++)
-                            sum += left[k] * grad[b * dim + k];
-                        K[(a * dim + i) * size + b * dim + j] += sum;
-                    }
-                }
-    for (int row = 0; row < size; row++)
-        for (int column = 0; column < row; column++)
-            K[row * size + column] = K[column * size + row];
-}
-
-/* Integrate the tangents of all cells into K (E, n·dim, n·dim), initially zero. */
-static void integrate_tangents(
-    int n, int dim, int points, const double *gradients, const double *volumes,
-    const double *A, ptrdiff_t E, double *K
-) {
-    const int size = n * dim, tensor = points * dim * dim * dim * dim;
-    for (ptrdiff_t e = 0; e < E; e++)
-        if (n == 4 && dim == 2 && points == 4)
-            cell_tangent(4, 2, 4, gradients + e * 32, volumes + e * 4, A + e * 64,
-                         K + e * 64);
-        else
-            cell_tangent(n, dim, points, gradients + e * points * size,
-                         volumes + e * points, A + e * tensor, K + e * size * size);
 }

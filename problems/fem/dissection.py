@@ -1,11 +1,12 @@
 """Nested dissection of a mesh: elimination order of a sparse Cholesky factorisation.
 
-A set of nodes is bisected across its longest principal axis. The nodes of the second
-half with a neighbour in the first half form the separator, which is eliminated after
-both halves. The halves are bisected recursively down to LEAF_SIZE nodes (George, SIAM
-J. Numer. Anal. 10, 1973; bisection by coordinates as in Gilbert, Miller and Teng, SIAM
-J. Sci. Comput. 19, 1998). Selected nodes are eliminated last, so that the trailing
-block of the factor is the Cholesky factor of the Schur complement on these nodes.
+A set of nodes is bisected at the median of the coordinate along which it is longest, in
+the principal axes of its connected component (recursive coordinate bisection, Berger
+and Bokhari, IEEE Trans. Comput. 36, 1987). The nodes of the second half with a
+neighbour in the first half form the separator, which is eliminated after both halves.
+The halves are bisected recursively down to LEAF_SIZE nodes (George, SIAM J. Numer.
+Anal. 10, 1973). Selected nodes are eliminated last, so that the trailing block of the
+factor is the Cholesky factor of the Schur complement on these nodes.
 
 Leaves, separators and the selected nodes of each connected component, each eliminated
 as a whole, are the fronts of a multifrontal factorisation
@@ -18,12 +19,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.fem.ordering import borders, dissect_components, node_graph
+from mortarbench.problems.fem.ordering import borders, dissect_components
 
 LEAF_SIZE = 8  #: sets of at most this many nodes are not bisected further
+#: entries of a matrix of inertia below this fraction of its trace count as rounding
+INERTIA_ROUNDING = 1e-9
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -62,15 +67,31 @@ def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
     order
 
     """
-    nodes = len(points)
-    ptr, idx = node_graph(*index_arrays(K), K.shape[0] // nodes, nodes)
-    is_last = np.zeros(nodes, dtype=np.bool_)
-    is_last[last] = True
-    order, start, children, roots = dissect_components(
-        ptr, idx, points, is_last, LEAF_SIZE
-    )
+    d = K.shape[0] // len(points)
+    graph = csr_array((K.data, K.indices, K.indptr), shape=K.shape).tobsr((d, d))
+    ptr, idx = index_arrays(graph)
+    pattern = csr_array((np.ones(idx.size), idx, ptr))
+    count, component = connected_components(pattern, directed=False)
+    key = 2 * component
+    key[last] += 1
+    x = np.empty_like(points)
+    for c in range(count):
+        x[component == c] = _principal(points[component == c])
+    order, start, children, roots = dissect_components(ptr, idx, x, key, LEAF_SIZE)
     first, border = borders(ptr, idx, order, start, children)
     return order.astype(np.int64), Fronts(start, first, border, children, roots)
+
+
+def _principal(points: Floats) -> Floats:
+    """Return the coordinates (N, dim) of points along their principal axes.
+
+    Products of inertia that are due to rounding count as zero, so that a cube keeps its
+    axes.
+    """
+    x = points - points.mean(axis=0)
+    inertia = x.T @ x
+    inertia[np.abs(inertia) < INERTIA_ROUNDING * np.trace(inertia)] = 0
+    return np.asarray(x @ np.linalg.eigh(inertia)[1])
 
 
 def expand_positions(fronts: Fronts, ends: Ints) -> Fronts:

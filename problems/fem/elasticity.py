@@ -230,6 +230,21 @@ class Pattern:
     indptr: NDArray[np.int32]  #: (n + 1,) column pointers of K in CSC
     indices: NDArray[np.int32]  #: row indices of K in CSC
 
+    def entries(self, dim: int) -> NDArray[np.int64]:
+        """Return the position in K.data of each entry of the cells' blocks.
+
+        The result is (E, c·dim, c·dim), with rows and columns ordered by corner, then
+        by component.
+        """
+        first = self.ptr[self.cells].astype(np.int64)
+        length = self.ptr[self.cells + 1] - first
+        k = np.arange(dim)
+        row = dim * (dim * first[..., None] + length[..., None] * k)
+        column = dim * self.slot.astype(np.int64)[..., None] + k
+        place = row[:, :, :, None, None] + column[:, :, None]
+        size = dim * self.cells.shape[1]
+        return np.asarray(place.reshape(-1, size, size))
+
 
 def sparsity(mesh: Mesh) -> Pattern:
     """Compute the sparsity pattern of K."""

@@ -42,7 +42,6 @@ from mortarbench.problems.fem.elasticity import (
 )
 from mortarbench.problems.fem.elements import Floats, determinant
 from mortarbench.problems.fem.hyperelastic import Hyperelastic
-from mortarbench.problems.fem.kernels import add_tangents, cell_tangents
 from mortarbench.problems.fem.mesh import Mesh, is_triangle
 
 #: smallest Poisson's ratio for which cells use the mean dilatation; for smaller ratios,
@@ -77,6 +76,7 @@ class Cells:
     gradients: Floats  #: (E, q, n, dim)  ∂N_a/∂X at the q Gauss points
     volumes: Floats  #: (E, q) weight of each Gauss point in the integral over the cell
     pattern: Pattern  #: sparsity of K_t
+    entries: NDArray[np.int64]  #: (E, n·dim, n·dim) positions of tangents in K_t.data
 
 
 class EnergyDerivatives(NamedTuple):
@@ -97,6 +97,7 @@ def cells_of(
     """
     corners = mesh.points[mesh.cells]
     points = [shape_gradients(corners, point) for point in mesh.element.points]
+    pattern = sparsity(mesh)
     return Cells(
         mesh,
         tuple(materials),
@@ -104,7 +105,8 @@ def cells_of(
         cell_dofs(mesh),
         gradients=np.stack([gradients for gradients, _ in points], axis=1),
         volumes=np.stack([det for _, det in points], axis=1),
-        pattern=sparsity(mesh),
+        pattern=pattern,
+        entries=pattern.entries(mesh.dim),
     )
 
 
@@ -165,7 +167,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
         A = w.second + slope[..., None, None, None, None] * theta.second
         if not mean:
             A += np.einsum("eq,eqij,eqkl->eqijkl", curvature, theta.first, theta.first)
-        tangents[index] = cell_tangents(gradients, volumes, A)
+        tangents[index] = _cell_tangents(gradients, volumes, A)
         if mean:
             g = _nodal(theta.first, gradients, volumes)
             part = curvature[:, 0] / volumes.sum(axis=1)
@@ -175,11 +177,8 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
 
 def assemble(cells: Cells, tangents: Floats) -> csc_array:
     """Assemble K_t (n, n) from the tangents of the cells."""
-    pattern = cells.pattern
-    data = add_tangents(
-        np.ascontiguousarray(tangents), pattern.cells, pattern.ptr, pattern.slot
-    )
-    n = cells.mesh.dofs
+    pattern, n = cells.pattern, cells.mesh.dofs
+    data = np.bincount(cells.entries.ravel(), tangents.ravel(), pattern.indices.size)
     return csc_array((data, pattern.indices, pattern.indptr), shape=(n, n))
 
 
@@ -298,6 +297,25 @@ def _nodal(P: Floats, gradients: Floats, volumes: Floats) -> Floats:
     at_points = gradients @ np.swapaxes(P, -1, -2)  # (E, q, n, dim)
     nodal = (volumes[:, :, None, None] * at_points).sum(axis=1)
     return np.asarray(nodal.reshape(-1, np.prod(nodal.shape[1:])))
+
+
+def _cell_tangents(gradients: Floats, volumes: Floats, A: Floats) -> Floats:
+    """Integrate  K_(ai)(bj) = Σ_q v_q ∂N_a/∂X_m A_imjn ∂N_b/∂X_n  of each cell.
+
+    gradients : (E, q, n, dim) shape function gradients at the quadrature points
+    volumes : (E, q) v_q
+    A : (E, q, dim, dim, dim, dim), symmetric
+
+    Returns
+    -------
+    (E, n·dim, n·dim), exactly symmetric
+
+    """
+    E, _, n, dim = gradients.shape
+    weighted = volumes[..., None, None] * gradients
+    left = np.einsum("eqam,eqimjn->eqaijn", weighted, A)
+    K = np.einsum("eqaijn,eqbn->eaibj", left, gradients).reshape(E, n * dim, n * dim)
+    return np.asarray((K + np.swapaxes(K, 1, 2)) / 2)
 
 
 def _on_corners(mesh: Mesh, tangents: Floats) -> Floats:

@@ -103,14 +103,6 @@ cdef extern from "cells.h" nogil:
         const int *cells, const double *D, const int *material, const int *ptr,
         const int *slot, double *data
     )
-    void sum_blocks(
-        int n, int dim, const double *blocks, Py_ssize_t E, const int *cells,
-        const int *ptr, const int *slot, double *data
-    )
-    void integrate_tangents(
-        int n, int dim, int points, const double *gradients, const double *volumes,
-        const double *A, Py_ssize_t E, double *K
-    )
 
 
 def add_stiffness(
@@ -145,52 +137,6 @@ def add_stiffness(
             &material[0], &ptr[0], &slot[0, 0, 0], &sums[0],
         )
     return values
-
-
-def add_tangents(
-    const double[:, :, ::1] tangents,
-    const int[:, ::1] cells,
-    const int[::1] ptr,
-    const int[:, :, ::1] slot,
-):
-    """Sum cell tangents (E, n·dim, n·dim) into entries in the order of `dof_pattern`.
-
-    ptr, slot : see `Pattern`
-    """
-    cdef int n = cells.shape[1]
-    cdef int dim = tangents.shape[1] // n
-    values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])
-    cdef double[::1] data = values
-    if cells.shape[0]:
-        sum_blocks(
-            n, dim, &tangents[0, 0, 0], cells.shape[0], &cells[0, 0], &ptr[0],
-            &slot[0, 0, 0], &data[0],
-        )
-    return values
-
-
-def cell_tangents(
-    const double[:, :, :, ::1] gradients,
-    const double[:, ::1] volumes,
-    const double[:, :, :, :, :, ::1] A,
-):
-    """Integrate  K_(ai)(bj) = Σ_q v_q ∂N_a/∂X_m A_imjn ∂N_b/∂X_n  of each cell.
-
-    gradients : (E, q, n, dim) shape function gradients at the quadrature points;
-    volumes : (E, q) v_q; A : (E, q, dim, dim, dim, dim), symmetric. The result
-    (E, n·dim, n·dim) is exactly symmetric.
-    """
-    cdef int points = gradients.shape[1], n = gradients.shape[2]
-    cdef int dim = gradients.shape[3]
-    cdef Py_ssize_t E = gradients.shape[0]
-    blocks = np.zeros((E, n * dim, n * dim))
-    cdef double[:, :, ::1] K = blocks
-    if E:
-        integrate_tangents(
-            n, dim, points, &gradients[0, 0, 0, 0], &volumes[0, 0],
-            &A[0, 0, 0, 0, 0, 0], E, &K[0, 0, 0],
-        )
-    return blocks
 
 
 def congruence(

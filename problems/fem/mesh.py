@@ -60,6 +60,9 @@ class Mesh:
     cells: Nodes
     #: mapping from the name of a boundary to its chain or faces
     boundaries: Mapping[str, Nodes]
+    #: numbers of cells of a structured mesh along its directions, of which the first
+    #: varies fastest in the numbers of nodes and cells; empty for other meshes
+    divisions: tuple[int, ...] = ()
 
     @property
     def dim(self) -> int:
@@ -81,109 +84,15 @@ class Mesh:
         """Cells grouped by kind, with meshio's names."""
         return cell_blocks(self.cells, self.dim)
 
-
-@dataclass(frozen=True, eq=False)
-class StructuredGrid:
-    """Structured plane grid with nx × ny cells.
-
-    The node in row j and column i has the number j·(nx + 1) + i; cells are also
-    numbered row by row.
-    """
-
-    points: NDArray[np.float64]  #: (ny + 1, nx + 1, 2) points of the nodes, row by row
-    names: tuple[str, str, str, str]  #: names of the sides, anticlockwise from row 0
-
     @property
-    def divisions(self) -> tuple[int, int]:
-        """Numbers of cells nx along a row and ny along a column."""
-        rows, columns, _ = self.points.shape
-        return columns - 1, rows - 1
+    def grid(self) -> NDArray[np.float64]:
+        """Points (…, dim) of a structured mesh, one axis per direction, fastest last.
 
-    @property
-    def nodes(self) -> int:
-        """Number of nodes."""
-        return self.points.size // 2
-
-    @property
-    def sides(self) -> Mapping[str, Nodes]:
-        """Nodes of the four sides, as chains of a mesh."""
-        nx, ny = self.divisions
-        across, up = np.arange(nx + 1), (nx + 1) * np.arange(ny + 1)
-        chains = across, up + nx, (up[-1] + across)[::-1], up[::-1]
-        return dict(zip(self.names, chains, strict=True))
-
-    def position(self, node: Nodes) -> NDArray[np.float64]:
-        """Return the points (k, 2) of nodes (k,)."""
-        return np.asarray(self.points.reshape(-1, 2)[node])
-
-    def prefixed(self, prefix: str) -> StructuredGrid:
-        """Return a copy with `prefix` added to the names of the sides."""
-        first, second, third, fourth = (prefix + name for name in self.names)
-        return replace(self, names=(first, second, third, fourth))
-
-    def mesh(self) -> Mesh:
-        """Return the mesh."""
-        nx, ny = self.divisions
-        points = self.points.reshape(-1, 2)
-        return Mesh(points, cells_of_block(nx + 1, ny + 1), self.sides)
-
-
-@dataclass(frozen=True, eq=False)
-class HalfDisc:
-    """Half disc divided into rings of cells, with triangles at its centre.
-
-    Let a and r be the numbers of angles and radii. The node on ring j at angle i has
-    the number j·a + i, and the centre is the last node, with the number a·r. Cells are
-    numbered ring by ring; the triangles come last.
-    """
-
-    centre: tuple[float, float]
-    angles: Vector  #: (a,) increasing by π from the first end of the arc to the last
-    radii: Vector  #: (r,) positive and decreasing, from the radius of the arc inwards
-    names: tuple[str, str] = ("arc", "flat")  #: names of the sides
-
-    @property
-    def nodes(self) -> int:
-        """Number of nodes."""
-        return self.angles.size * self.radii.size + 1
-
-    @property
-    def sides(self) -> Mapping[str, Nodes]:
-        """Nodes of the arc, anticlockwise, and of the flat side through the centre."""
-        a, r = self.angles.size, self.radii.size
-        rings = a * np.arange(r)
-        flat = np.concatenate([rings + a - 1, [a * r], rings[::-1]])
-        return dict(zip(self.names, (np.arange(a), flat), strict=True))
-
-    def position(self, node: Nodes) -> NDArray[np.float64]:
-        """Return the points (k, 2) of nodes (k,)."""
-        ring, angle = np.divmod(node, self.angles.size)
-        radius = np.append(self.radii, 0.0)[ring][:, None]
-        direction = np.stack([np.cos(self.angles), np.sin(self.angles)], axis=-1)
-        return np.asarray(np.asarray(self.centre) + radius * direction[angle])
-
-    def lengths(self) -> tuple[tuple[Vector, Vector], tuple[Vector, Vector]]:
-        """Return the mean lengths of cells along radii and along arcs.
-
-        The length of a cell is the product of two factors, one for its ring and one for
-        its angle. The factors of each length are returned as a pair (rings, angles).
+        The centre of a half disc is repeated for every angle.
         """
-        half, r = np.diff(self.angles) / 2, np.append(self.radii, 0.0)
-        return (-np.diff(r), np.cos(half)), ((r[1:] + r[:-1]) / 2, 2 * np.sin(half))
-
-    def prefixed(self, prefix: str) -> HalfDisc:
-        """Return a copy with `prefix` added to the names of the sides."""
-        arc, flat = (prefix + name for name in self.names)
-        return replace(self, names=(arc, flat))
-
-    def mesh(self) -> Mesh:
-        """Return the mesh."""
-        a, r = self.angles.size, self.radii.size
-        inner = np.arange(a * (r - 1), a * r)
-        triangles = [inner[:-1], inner[1:], *np.full((2, a - 1), a * r)]
-        cells = [cells_of_block(a, r), np.stack(triangles, axis=-1)]
-        points = self.position(np.arange(self.nodes))
-        return Mesh(points, np.concatenate(cells), self.sides)
+        counts = [n + 1 for n in reversed(self.divisions)]
+        node = np.minimum(np.arange(np.prod(counts)), len(self.points) - 1)
+        return self.points[node].reshape(*counts, self.dim)
 
 
 def cells_of_block(columns: int, rows: int) -> Nodes:
@@ -193,18 +102,20 @@ def cells_of_block(columns: int, rows: int) -> Nodes:
     return np.stack(corners, axis=-1).reshape(-1, 4)
 
 
-def rectangle_grid(
-    corner: tuple[float, float], size: tuple[float, float], divisions: tuple[int, int]
-) -> StructuredGrid:
-    """Divide a rectangle into nx × ny equal cells.
+def structured(points: NDArray[np.float64], names: Sequence[str]) -> Mesh:
+    """Mesh a plane grid of nodes (l, k, 2), row by row, with quadrilaterals.
 
-    The sides are bottom, right, top and left.
+    names : names of the sides, anticlockwise from row 0
     """
-    nx, ny = divisions
-    x = corner[0] + size[0] * np.arange(nx + 1) / nx
-    y = corner[1] + size[1] * np.arange(ny + 1) / ny
-    points = np.stack(np.meshgrid(x, y), axis=-1)
-    return StructuredGrid(points, names=("bottom", "right", "top", "left"))
+    rows, columns, _ = points.shape
+    across, up = np.arange(columns), columns * np.arange(rows)
+    chains = across, up + columns - 1, (up[-1] + across)[::-1], up[::-1]
+    return Mesh(
+        points.reshape(-1, 2),
+        cells_of_block(columns, rows),
+        dict(zip(names, chains, strict=True)),
+        (columns - 1, rows - 1),
+    )
 
 
 def box(
@@ -251,6 +162,7 @@ def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
             name: facets[centre[:, k] == place]
             for name, (k, place) in zip(names, planes, strict=True)
         },
+        (x.size - 1, y.size - 1, z.size - 1),
     )
 
 
@@ -276,7 +188,8 @@ def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
     boundaries = {
         name: (table + ends[0]).reshape(-1, 4) for name, table in facets.items()
     }
-    return Mesh(points, cells.reshape(-1, 8), boundaries)
+    divisions = (*mesh.divisions, layers) if mesh.divisions else ()
+    return Mesh(points, cells.reshape(-1, 8), boundaries, divisions)
 
 
 def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
@@ -292,24 +205,6 @@ def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
     return replace(mesh, points=points + move)
 
 
-def half_ring_grid(
-    centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
-) -> StructuredGrid:
-    """Divide the upper half of a ring into cells of equal angle and equal thickness.
-
-    The sides are outer (from angle 0 to π), left_foot, inner and right_foot.
-
-    radii : inner and outer radius
-    divisions : numbers of cells along the arc and across the ring
-    """
-    angles, layers = divisions
-    theta = np.pi * np.arange(angles + 1) / angles
-    r = radii[1] + (radii[0] - radii[1]) * np.arange(layers + 1) / layers
-    direction = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    points = np.asarray(centre) + r[:, None, None] * direction
-    return StructuredGrid(points, ("outer", "left_foot", "inner", "right_foot"))
-
-
 def rectangle(
     corner: tuple[float, float], size: tuple[float, float], divisions: tuple[int, int]
 ) -> Mesh:
@@ -320,7 +215,11 @@ def rectangle(
     >>> rectangle((0.0, 0.5), (2.0, 0.25), (8, 1)).points[-1].tolist()
     [2.0, 0.75]
     """
-    return rectangle_grid(corner, size, divisions).mesh()
+    nx, ny = divisions
+    x = corner[0] + size[0] * np.arange(nx + 1) / nx
+    y = corner[1] + size[1] * np.arange(ny + 1) / ny
+    points = np.stack(np.meshgrid(x, y), axis=-1)
+    return structured(points, ("bottom", "right", "top", "left"))
 
 
 def half_ring(
@@ -333,7 +232,12 @@ def half_ring(
     radii : inner and outer radius, m
     divisions : numbers of cells along the arc and across the ring
     """
-    return half_ring_grid(centre, radii, divisions).mesh()
+    angles, layers = divisions
+    theta = np.pi * np.arange(angles + 1) / angles
+    r = radii[1] + (radii[0] - radii[1]) * np.arange(layers + 1) / layers
+    direction = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    points = np.asarray(centre) + r[:, None, None] * direction
+    return structured(points, ("outer", "left_foot", "inner", "right_foot"))
 
 
 def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mesh:
@@ -348,7 +252,20 @@ def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mes
         arc
 
     """
-    return HalfDisc(centre, angles, radii).mesh()
+    a, r = angles.size, radii.size
+    direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    rings = np.asarray(centre) + radii[:, None, None] * direction
+    inner, first = np.arange(a * (r - 1), a * r), a * np.arange(r)
+    triangles = [inner[:-1], inner[1:], *np.full((2, a - 1), a * r)]
+    return Mesh(
+        np.append(rings.reshape(-1, 2), [centre], axis=0),
+        np.concatenate([cells_of_block(a, r), np.stack(triangles, axis=-1)]),
+        {
+            "arc": np.arange(a),
+            "flat": np.concatenate([first + a - 1, [a * r], first[::-1]]),
+        },
+        (a - 1, r),
+    )
 
 
 def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
@@ -372,16 +289,6 @@ def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
     body = np.repeat(np.arange(len(meshes)), [len(m.cells) for m in meshes])
     points = np.concatenate([m.points for m in meshes])
     return Mesh(points, np.concatenate(cells), boundaries), body
-
-
-def joined_sides(bodies: Sequence[StructuredGrid | HalfDisc]) -> Mapping[str, Nodes]:
-    """Return the sides of bodies by name, with nodes numbered as in `join`."""
-    starts = np.cumsum([0] + [body.nodes for body in bodies])
-    return {
-        name: nodes + start
-        for body, start in zip(bodies, starts, strict=False)
-        for name, nodes in body.sides.items()
-    }
 
 
 def prefixed(mesh: Mesh, prefix: str) -> Mesh:
@@ -458,6 +365,13 @@ def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vecto
     total = np.zeros(nodes.size)
     np.add.at(total, place.reshape(faces.shape), shares)
     return nodes, total
+
+
+def nodal_sizes(points: NDArray[np.float64], side: Nodes) -> tuple[Nodes, Vector]:
+    """Return the nodes of a chain or of faces, with their lengths, m, or areas, m²."""
+    if side.ndim > 1:
+        return nodal_areas(points, side)
+    return side, nodal_lengths(points[side])
 
 
 def nodes_of_side(side: Nodes) -> Nodes:

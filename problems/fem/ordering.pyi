@@ -5,12 +5,8 @@ Ints = NDArray[np.int32]
 Floats = NDArray[np.float64]
 Marks = NDArray[np.bool_]
 
-def node_graph(
-    indptr: Ints, indices: Ints, d: int, nodes: int
-) -> tuple[Ints, Ints]: ...
-def components(ptr: Ints, idx: Ints) -> Ints: ...
 def dissect_components(
-    ptr: Ints, idx: Ints, points: Floats, is_last: Marks, leaf: int
+    ptr: Ints, idx: Ints, points: Floats, key: Ints, leaf: int
 ) -> tuple[Ints, Ints, Ints, Marks]: ...
 def borders(
     ptr: Ints, idx: Ints, order: Ints, start: Ints, children: Ints

@@ -2,73 +2,25 @@
 # cython: initializedcheck=False
 """Compiled loops of nested dissection, see `problems.fem.dissection`."""
 
-from libc.math cimport INFINITY, atan2, cos, fabs, fmax, fmin, sin
+from libc.math cimport INFINITY, fmax, fmin
 from libc.stdint cimport int64_t
 
 import numpy as np
 
-#: number of Jacobi sweeps for a 3 × 3 matrix; since convergence is quadratic, four
-#: suffice for double precision
-cdef int SWEEPS = 8
-#: off-diagonal entries, and differences of eigenvalues, count as zero up to this
-#: multiple of the trace
+#: relative difference of coordinates and extents that counts as rounding
 cdef double ROUNDING = 1e-9
 
 
-def node_graph(const int[::1] indptr, const int[::1] indices, int d, int nodes):
-    """Return the node graph (ptr, idx) of a matrix pattern with d components per node.
-
-    A node is not its own neighbour.
-    """
-    cdef Py_ssize_t a, b, t, end = 0
-    pointers = np.zeros(nodes + 1, dtype=np.int32)
-    neighbours = np.empty(indices.shape[0], dtype=np.int32)
-    cdef int[::1] ptr = pointers, idx = neighbours
-    cdef int[::1] seen = np.full(nodes, -1, dtype=np.int32)
-    for a in range(nodes):
-        seen[a] = a
-        for t in range(indptr[d * a], indptr[d * (a + 1)]):
-            b = indices[t] // d
-            if seen[b] != a:
-                seen[b] = a
-                idx[end] = b
-                end += 1
-        ptr[a + 1] = end
-    return pointers, neighbours[:end].copy()
-
-
-def components(const int[::1] ptr, const int[::1] idx):
-    """Return the number of the connected component of each node, (N,).
-
-    Components are numbered in the order of their first nodes.
-    """
-    cdef Py_ssize_t seed, t, at, end, nodes = ptr.shape[0] - 1
-    cdef int count = 0
-    numbers = np.full(nodes, -1, dtype=np.int32)
-    cdef int[::1] number = numbers, queue = np.empty(nodes, dtype=np.int32)
-    for seed in range(nodes):
-        if number[seed] >= 0:
-            continue
-        number[seed], queue[0], at, end = count, seed, 0, 1
-        while at < end:
-            for t in range(ptr[queue[at]], ptr[queue[at] + 1]):
-                if number[idx[t]] < 0:
-                    number[idx[t]], queue[end] = count, idx[t]
-                    end += 1
-            at += 1
-        count += 1
-    return numbers
-
-
 def dissect_components(
-    const int[::1] ptr, const int[::1] idx, const double[:, :] points, is_last, int leaf
+    const int[::1] ptr, const int[::1] idx, const double[:, :] points, key, int leaf
 ):
     """Dissect each connected component, see `dissect` and `Fronts`.
 
+    key : (N,) twice the number of the component of each node, plus 1 for nodes that are
+        eliminated last
+
     Returns order (N,), start (F + 1,), children (F,) and roots (F,).
     """
-    # order by component, then `is_last`, then node number
-    key = 2 * components(ptr, idx) + is_last
     chosen = np.argsort(key, kind="stable").astype(np.int32)
     ends = np.append(0, np.bincount(key, minlength=key.max() // 2 * 2 + 2).cumsum())
     cdef int[::1] order = chosen
@@ -84,7 +36,7 @@ def dissect_components(
     # half of each node in the last bisection
     cdef int[::1] side = np.zeros(nodes, dtype=np.int32)
     cdef int[::1] kind = np.empty(nodes, dtype=np.int32), copy = np.empty_like(kind)
-    cdef double[:, ::1] along = np.empty((2, nodes))
+    cdef double[::1] along = np.empty(nodes)
     cdef int cut = 0
     for c in range(end.shape[0] // 2):
         # reversed postorder: separator, second half, first half
@@ -122,27 +74,33 @@ def dissect_components(
 
 cdef void bisect(
     const int[::1] ptr, const int[::1] idx, const double[:, :] points, int[::1] part,
-    int[::1] side, int cut, int[::1] kind, int[::1] copy, double[:, ::1] along,
+    int[::1] side, int cut, int[::1] kind, int[::1] copy, double[::1] along,
     Py_ssize_t *middle, Py_ssize_t *separator,
 ) noexcept:
     """Reorder `part` to first half, second half and separator.
 
     `middle` and `separator` are set to the offsets of the second half and of the
     separator, and `side` to `cut` on the first half and to cut + 1 on the other nodes.
-    `kind`, `copy` and `along` (2, N) are workspace.
+    `kind`, `copy` and `along` (N,) are workspace.
     """
     cdef Py_ssize_t a, t, s, n = part.shape[0]
-    cdef double value, least = INFINITY, most = -INFINITY
+    cdef Py_ssize_t k, axis = 0
+    cdef double value, least, most, extent = -1
     cdef Py_ssize_t[3] count = [0, 0, 0]
-    coordinates(points, part, along[0])
+    for k in range(points.shape[1]):
+        least, most = INFINITY, -INFINITY
+        for t in range(n):
+            value = points[part[t], k]
+            least, most = fmin(least, value), fmax(most, value)
+        if most - least > (1 + ROUNDING) * extent:
+            axis, extent = k, most - least
     for t in range(n):
-        along[1, t] = along[0, t]
-        least, most = fmin(least, along[0, t]), fmax(most, along[0, t])
+        along[t] = points[part[t], axis]
     # without the tolerance, rounding of the coordinates could assign nodes of the grid
     # line at the median to different halves
-    value = find(&along[1, 0], n, n // 2) - 1e-9 * (most - least)
+    value = find(&along[0], n, n // 2) - ROUNDING * extent
     for t in range(n):
-        side[part[t]] = cut + (along[0, t] >= value)
+        side[part[t]] = cut + (points[part[t], axis] >= value)
     for t in range(n):
         a = part[t]
         copy[t], kind[t] = a, 0
@@ -158,71 +116,6 @@ cdef void bisect(
     for t in range(n):
         part[count[kind[t]]] = copy[t]
         count[kind[t]] += 1
-
-
-cdef void coordinates(
-    const double[:, :] points, const int[::1] part, double[::1] along
-) noexcept:
-    """Write the coordinates of the nodes `part` along their longest principal axis."""
-    cdef Py_ssize_t t, k, l, n = part.shape[0], dim = points.shape[1]
-    cdef double[3] mean = [0.0, 0.0, 0.0]
-    cdef double[3] axis
-    cdef double[3][3] C = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    for t in range(n):
-        for k in range(dim):
-            mean[k] += points[part[t], k]
-    for k in range(dim):
-        mean[k] /= n
-    for t in range(n):
-        for k in range(dim):
-            axis[k] = points[part[t], k] - mean[k]
-        for k in range(dim):
-            for l in range(k, dim):
-                C[k][l] += axis[k] * axis[l]
-    principal_axis(C, dim, axis)
-    for t in range(n):
-        along[t] = (points[part[t], 0] - mean[0]) * axis[0]
-        for k in range(1, dim):
-            along[t] += (points[part[t], k] - mean[k]) * axis[k]
-
-
-cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcept:
-    """Write the eigenvector for the largest eigenvalue of C (upper triangle) to `axis`.
-
-    In 3D, the eigenvector is computed by the cyclic Jacobi method. Off-diagonal
-    entries due to rounding are not eliminated, so that a cube is bisected across its
-    edges.
-    """
-    cdef Py_ssize_t k, l, j, sweep, longest = 0
-    cdef double angle, c, s, one, other, size = C[0][0] + C[1][1] + C[2][2]
-    cdef double[3][3] V = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    if dim == 2:
-        angle = atan2(2 * C[0][1], C[0][0] - C[1][1]) / 2
-        axis[0], axis[1] = cos(angle), sin(angle)
-        return
-    for k in range(1, 3):
-        for l in range(k):
-            C[k][l] = C[l][k]
-    for sweep in range(SWEEPS):
-        for k in range(2):
-            for l in range(k + 1, 3):
-                if fabs(C[k][l]) <= ROUNDING * size:
-                    continue
-                angle = atan2(2 * C[k][l], C[k][k] - C[l][l]) / 2
-                c, s = cos(angle), sin(angle)
-                for j in range(3):  # C and V times the rotation from the right …
-                    one, other = C[j][k], C[j][l]
-                    C[j][k], C[j][l] = c * one + s * other, c * other - s * one
-                    one, other = V[j][k], V[j][l]
-                    V[j][k], V[j][l] = c * one + s * other, c * other - s * one
-                for j in range(3):  # … and its transpose times C from the left
-                    one, other = C[k][j], C[l][j]
-                    C[k][j], C[l][j] = c * one + s * other, c * other - s * one
-    for k in range(1, 3):  # if axes are equally long up to rounding, select the first
-        if C[k][k] > C[longest][longest] + ROUNDING * size:
-            longest = k
-    for k in range(3):
-        axis[k] = V[k][longest]
 
 
 cdef double find(double *v, Py_ssize_t n, Py_ssize_t k) noexcept:

@@ -50,6 +50,7 @@ from scipy.sparse.csgraph import connected_components
 from mortarbench.harness import Vector
 from mortarbench.harness.distributed.factor import bordered_factor
 from mortarbench.harness.distributed.sparse import (
+    Block,
     Composition,
     CompressedRows,
     DirectSum,
@@ -58,7 +59,6 @@ from mortarbench.harness.distributed.sparse import (
 )
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.blocks import BlockDiagonal
 from mortarbench.problems.feti.subdomain_classes import (
     Dense,
     SubdomainClass,
@@ -108,13 +108,13 @@ class Packed:
         """Return the map x ↦ B_b diag(blocks) B_bᵀx for x (m,) or (m, k)."""
         return Composition(CompressedRows(self.B), blocks, CompressedRows(self.BT))
 
-    def block_diagonal(self, blocks: Sequence[Any]) -> BlockDiagonal:
+    def block_diagonal(self, blocks: Sequence[Any]) -> DirectSum:
         """Return the block diagonal map of packed components (M,), one block per group.
 
-        blocks : block of each group, as for `BlockDiagonal`
+        blocks : block of each group, as for `Block`
         """
-        sizes = [group.touched.size for group in self.groups]
-        return BlockDiagonal(blocks, sizes, [g.members.size for g in self.groups])
+        pairs = zip(blocks, self.groups, strict=True)
+        return DirectSum(*(Block(M, g.touched.size, g.members.size) for M, g in pairs))
 
     def diagonal(self, blocks: Sequence[Any]) -> Vector:
         """Return the diagonal of  B_b diag(blocks) B_bᵀ.

@@ -23,39 +23,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
-from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid, join
+from mortarbench.problems.fem.mesh import Mesh, Nodes
 from mortarbench.problems.feti.subdivision import Shaping, Subdivision
-from mortarbench.problems.feti.tearing import blocks, joined_labels
+from mortarbench.problems.feti.tearing import blocks, compact_blocks, joined_labels
 
 
-def grids_in_blocks(
-    grids: tuple[StructuredGrid, ...],
-    most: int | tuple[int, ...],
-    joined: tuple[Mesh, Nodes] | None = None,
+def blocks_of_meshes(
+    parts: tuple[Mesh, ...], most: int, joined: tuple[Mesh, Nodes]
 ) -> Subdivision:
-    """Cut grids into blocks of at most `most` cells per side.
+    """Cut structured meshes into blocks of at most `most` cells per side.
 
-    most : one limit for both directions, or a pair of limits
-    joined : mesh of all grids and body (E,) of each cell, see `join`
+    Plane grids are cut evenly, half discs and boxes of hexahedra by `compact_blocks`.
+
+    joined : mesh of all bodies and body (E,) of each cell, see `join`
     """
-    mesh, body = joined or join(tuple(grid.mesh() for grid in grids))
-    label = joined_labels([blocks(grid.divisions, most) for grid in grids])
-    return Subdivision(mesh, label, body, partial(_shaping, grids, most))
+    mesh, body = joined
+    if mesh.dim == 3 or any(part.grid.size > part.points.size for part in parts):
+        label = joined_labels([compact_blocks(part.grid, most) for part in parts])
+        return Subdivision(mesh, label, body)
+    label = joined_labels([blocks(part.divisions, most) for part in parts])
+    return Subdivision(mesh, label, body, partial(_shaping, parts, most))
 
 
-def _shaping(
-    grids: tuple[StructuredGrid, ...], most: int | tuple[int, ...], share: Vector
-) -> Shaping:
+def _shaping(parts: tuple[Mesh, ...], most: int, share: Vector) -> Shaping:
     """Return `shape_factors` as a function of nodes.
 
-    share : (grids,) C₁₁/(C₁₁ + C₆₆) of each grid
+    share : (parts,) C₁₁/(C₁₁ + C₆₆) of each body
     """
-    sides = np.concatenate([spacings(grid.points) for grid in grids])
+    sides = np.concatenate([spacings(part.grid) for part in parts])
     interfaces, borders = (
-        np.concatenate([lines(grid.divisions, most, ends=ends) for grid in grids])
+        np.concatenate([lines(part.divisions, most, ends=ends) for part in parts])
         for ends in (False, True)
     )
-    of_node = np.repeat(share, [grid.nodes for grid in grids])
+    of_node = np.repeat(share, [len(part.points) for part in parts])
 
     def factors(node: Nodes, supports: bool) -> Vector:
         at = (borders if supports else interfaces)[node]
@@ -64,16 +64,14 @@ def _shaping(
     return factors
 
 
-def lines(
-    divisions: tuple[int, int], most: int | tuple[int, ...], *, ends: bool
-) -> NDArray[np.bool_]:
+def lines(divisions: tuple[int, ...], most: int, *, ends: bool) -> NDArray[np.bool_]:
     """Return masks (N, 2) of the nodes whose row, or column, separates blocks.
 
     ends : also mark the sides of the grid, as required for rows of supports
     """
     columns, rows = (np.full(cells + 1, ends) for cells in divisions)
-    for line, side in zip((columns, rows), np.broadcast_to(most, 2), strict=True):
-        line[1:-1] = np.diff(blocks((line.size - 1,), int(side))) != 0
+    for line in (columns, rows):
+        line[1:-1] = np.diff(blocks((line.size - 1,), most)) != 0
     return np.stack(np.broadcast_arrays(rows[:, None], columns), axis=-1).reshape(-1, 2)
 
 

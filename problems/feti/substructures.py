@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.harness.verify.products import projected_products
+from mortarbench.harness.mechanics import in_precision
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import TornBodies
 
@@ -69,11 +69,13 @@ class LocalProblems:
         P is the orthogonal projector that removes rigid motions.
         """
         image, domains = np.zeros_like(v), self.torn.domains
-        for k, members in domains.own:
-            K, R = domains.template(k).K, np.ascontiguousarray(domains.template(k).R)
-            projected_products(
-                K.data, K.indices, K.indptr, R, domains.start[members], v, image
-            )
+        for template, place in domains.places():
+            place = place[:, (v[place] != 0).any(axis=0)]  # PKP maps zero to zero
+            columns, R = v[place], template.R
+            columns -= R @ (R.T @ columns)
+            columns = in_precision(template.K, v.dtype) @ columns
+            columns -= R @ (R.T @ columns)
+            image[place] = columns
         return domains.combined(image)
 
     def squared_product(self, v: Vector) -> Vector:

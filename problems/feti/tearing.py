@@ -59,124 +59,101 @@ def blocks(
     return label
 
 
-Block = tuple[slice, slice]  #: ranges of rows and columns of cells
-#: lengths of cell sides, first along columns, then along rows; each length is the
-#: product of two factors, one for the row and one for the column of the cell
-Sides = tuple[tuple[Vector, Vector], tuple[Vector, Vector]]
+def compact_blocks(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """Label the cells of a structured mesh by blocks of compact shape.
 
-
-def compact_blocks(sides: Sides, most: int) -> list[Block]:
-    """Cut a graded structured mesh into blocks that have aspect ratios near one.
-
-    A block of more than most² cells is cut across its longer side (or across the other
-    side if the longer one consists of a single cell), at the grid line nearest to its
-    middle (the first one if two are equally near up to rounding). With equal numbers of
-    cells along both sides, as in `blocks`, a block would have the aspect ratio of its
-    cells, and the bending modes of long subdomains would dominate the condition number
-    of the dual.
-
-    Parameters
-    ----------
-    sides : side lengths of the cells
-    most : number H/h of cells along a side of a square block
-
-    """
-    (deep, deep_of), (wide_of, wide) = sides
-    finished, pending = list[Block](), [(slice(0, deep.size), slice(0, wide.size))]
-    while pending:
-        rows, columns = pending.pop()
-        lengths = (
-            deep[rows] * deep_of[columns].mean(),
-            wide[columns] * wide_of[rows].mean(),
-        )
-        size = [0.0 if part.size == 1 else part.sum() for part in lengths]
-        if lengths[0].size * lengths[1].size <= most**2 or not any(size):
-            finished.append((rows, columns))
-            continue
-        k = int(size[1] > size[0] * (1 + CONGRUENCE_TOL))
-        ends = np.cumsum(lengths[k])
-        off = np.abs(ends[:-1] - ends[-1] / 2)
-        nearest = int(np.argmax(off <= off.min() + CONGRUENCE_TOL * ends[-1]))
-        cut = (rows, columns)[k]
-        at = cut.start + nearest + 1
-        for part in (slice(at, cut.stop), slice(cut.start, at)):
-            pending.append((part, columns) if k == 0 else (rows, part))
-    return finished
-
-
-def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Label the cells of a structured mesh in 3D by blocks of compact shape.
-
-    Let hₐ be the mean edge length of a block along direction a. The block may have
-    most · min h / hₐ cells along a, rounded, and at least 1. A larger block is cut
-    in two across the longest of the sides that exceed their limits. Let p be the least
-    number of equal parts within the limit of this side; the cut is placed after ⌊p/2⌋
-    of these parts, rounded up to a whole cell. Boxes of cubic cells are cut as in
-    `blocks`. With equal numbers of cells along all directions, slender cells would
-    result in slender subdomains: the condition number of PFP (see
-    `problems.feti.spectrum`) is 439 with 4 × 4 × 4 cells of 1 : 1 : 4 in
-    beam-ring/Nr=4/Nh=2/depth=4.
+    Blocks are cut in two until they fulfil a limit. With equal numbers of cells along
+    all directions, as in `blocks`, a block would have the aspect ratio of its cells,
+    and the bending modes of slender subdomains would dominate the condition number of
+    the dual: that of PFP (see `problems.feti.spectrum`) is 439 with 4 × 4 × 4 cells of
+    1 : 1 : 4 in beam-ring/Nr=4/Nh=2/depth=4. The limits are those of `_cut_middle` in
+    2D, and of `_cut_evenly` in 3D.
 
     Parameters
     ----------
     points : (…, dim) points of the nodes, with one axis per direction, the fastest last
-    most : largest number of cells along a side
+    most : number of cells along a side of a block of cubes, or of squares
 
     Returns
     -------
-    block (E,) of each cell; blocks are numbered in the order of their first cells
+    block (E,) of each cell; blocks of boxes are numbered in the order of their first
+    cells, and plane blocks such that halves of a cut are numbered one after the other
 
     """
     cells = [n - 1 for n in points.shape[:-1]]
-    edges = [
-        np.linalg.norm(np.diff(points, axis=a), axis=-1) for a in range(len(cells))
-    ]
+    axes = range(len(cells))
+    edges = [np.linalg.norm(np.diff(points, axis=a), axis=-1) for a in axes]
+    cut = _cut_middle if len(cells) == 2 else _cut_evenly
     finished, pending = list[tuple[slice, ...]](), [tuple(slice(0, n) for n in cells)]
     while pending:
         block = pending.pop()
-        count = np.array([part.stop - part.start for part in block])
         nodes = [slice(part.start, part.stop + 1) for part in block]
-        h = np.array(
-            [
-                edge[(*nodes[:a], block[a], *nodes[a + 1 :])].mean()
-                for a, edge in enumerate(edges)
-            ]
-        )
-        # fractions that rounding moved just below ½ count as ½, so that congruent
-        # blocks are cut equally
-        side = np.floor(most * h.min() / h + 0.5 + CONGRUENCE_TOL).clip(1, most)
-        parts = np.ceil(count / side).astype(int)
-        if (parts == 1).all():
+        means = [
+            edges[a][(*nodes[:a], block[a], *nodes[a + 1 :])].mean(
+                axis=tuple(k for k in axes if k != a)
+            )
+            for a in axes
+        ]
+        if (place := cut(means, most)) is None:
             finished.append(block)
             continue
-        length = np.where(parts > 1, count * h, 0.0)
-        a = int(np.argmax(length >= length.max() * (1 - CONGRUENCE_TOL)))
-        at = block[a].start - (-int(count[a]) * (parts[a] // 2) // parts[a])
-        for part in (slice(block[a].start, at), slice(at, block[a].stop)):
+        a, at = place[0], block[place[0]].start + place[1]
+        for part in (slice(at, block[a].stop), slice(block[a].start, at)):
             pending.append((*block[:a], part, *block[a + 1 :]))
+    if len(cells) == 3:
+        finished.sort(key=lambda block: [part.start for part in block])
     label = np.empty(cells, dtype=np.int64)
-    for number, block in enumerate(sorted(finished, key=_first_cell)):
+    for number, block in enumerate(finished):
         label[block] = number
     return label.ravel()
 
 
-def _first_cell(block: Sequence[slice]) -> list[int]:
-    return [part.start for part in block]
+def _cut_middle(lengths: Sequence[Vector], most: int) -> tuple[int, int] | None:
+    """Return the direction and the place of a cut of a plane block, or None.
+
+    A block of more than most² cells is cut across its longer side (or across the other
+    side if the longer one consists of a single cell), at the grid line nearest to its
+    middle (the first one if two are equally near up to rounding).
+
+    lengths : mean lengths of the cells along each direction
+    """
+    size = [0.0 if part.size == 1 else part.sum() for part in lengths]
+    if lengths[0].size * lengths[1].size <= most**2 or not any(size):
+        return None
+    k = int(size[1] > size[0] * (1 + CONGRUENCE_TOL))
+    ends = np.cumsum(lengths[k])
+    off = np.abs(ends[:-1] - ends[-1] / 2)
+    return k, 1 + int(np.argmax(off <= off.min() + CONGRUENCE_TOL * ends[-1]))
+
+
+def _cut_evenly(lengths: Sequence[Vector], most: int) -> tuple[int, int] | None:
+    """Return the direction and the place of a cut of a box, or None.
+
+    Let hₐ be the mean edge length of a block along direction a. The block may have
+    most · min h / hₐ cells along a, rounded, and at least 1. A larger block is cut
+    across the longest of the sides that exceed their limits. Let p be the least number
+    of equal parts within the limit of this side; the cut is placed after ⌊p/2⌋ of these
+    parts, rounded up to a whole cell. Boxes of cubic cells are cut as in `blocks`.
+
+    lengths : mean lengths of the cells along each direction
+    """
+    count = np.array([part.size for part in lengths])
+    h = np.array([part.mean() for part in lengths])
+    # fractions that rounding moved just below ½ count as ½, so that congruent blocks
+    # are cut equally
+    side = np.floor(most * h.min() / h + 0.5 + CONGRUENCE_TOL).clip(1, most)
+    parts = np.ceil(count / side).astype(int)
+    if (parts == 1).all():
+        return None
+    length = np.where(parts > 1, count * h, 0.0)
+    a = int(np.argmax(length >= length.max() * (1 - CONGRUENCE_TOL)))
+    return a, -(-int(count[a]) * int(parts[a] // 2) // int(parts[a]))
 
 
 def joined_labels(labels: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
     """Join the labels of the cells of several bodies, numbered body by body."""
     first = np.cumsum([0, *(int(label.max()) + 1 for label in labels)])
     return np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
-
-
-def label_blocks(cut: Sequence[Block]) -> NDArray[np.int64]:
-    """Return the block of each cell, row by row."""
-    shape = [max(block[k].stop for block in cut) for k in (0, 1)]
-    label = np.empty(shape, dtype=np.int64)
-    for b, block in enumerate(cut):
-        label[block] = b
-    return label.ravel()
 
 
 def classify(

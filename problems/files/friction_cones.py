@@ -199,10 +199,7 @@ class FrictionalContact:
             q=q,
             A=csr_array(self.A),
             b=self.b,
-            G=no_rows(q.size),
-            h=np.zeros(0),
             lb=lower,
-            ub=np.full(q.size, np.inf),
             sets=(one,),
         )
 

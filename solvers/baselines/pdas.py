@@ -26,7 +26,7 @@ set no longer changes. Three extensions handle QPs on which this iteration fails
    number of wrong constraints falls below its previous minimum. This procedure
    terminates, because the systems of extension 1 belong to a strictly convex problem.
 3. Certificates of infeasibility. After each change of the centre, the difference of the
-   last two centres is tested (`solvers.baselines.infeasibility_certificate`).
+   last two centres is tested (`solvers.common.infeasibility_certificate`).
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ from mortarbench.solvers.baselines.active_set import (
     penalise,
     solve_subproblem,
 )
-from mortarbench.solvers.baselines.infeasibility_certificate import (
+from mortarbench.solvers.common.conversion import check_positive
+from mortarbench.solvers.common.infeasibility_certificate import (
     proves_infeasible,
     proves_unbounded,
 )
-from mortarbench.solvers.common.conversion import check_positive
 from mortarbench.solvers.common.stopping import relative_residual
 
 #: Factor by which ρ increases after every two consecutive changes of the centre,

@@ -38,12 +38,12 @@ from mortarbench.harness import (
     Vector,
 )
 from mortarbench.harness.sets.convex import hull
-from mortarbench.solvers.baselines.infeasibility_certificate import (
+from mortarbench.solvers.baselines.natural_map import Problem
+from mortarbench.solvers.common.conversion import check_positive
+from mortarbench.solvers.common.infeasibility_certificate import (
     ROUNDING,
     proves_unbounded,
 )
-from mortarbench.solvers.baselines.natural_map import Problem
-from mortarbench.solvers.common.conversion import check_positive
 
 SUFFICIENT_DECREASE = 1e-4  #: fraction of the linear decrease that a step must achieve
 

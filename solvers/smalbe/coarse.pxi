@@ -35,9 +35,10 @@ cdef class Coarse:
         self.n, self.k = source.unit.shape
         self.places = bounded.shape[0]
         self.bounded = &bounded[0] if self.places else NULL
-        self.by_components, self.rows = source.unit, source.unit.transposed()
-        self.of_bounded, self.original = source.of_bounded, transposed_rows(source.G)
-        self.matrix, self.factor = symmetric_rows(source.matrix), source.factor
+        self.by_components, self.rows = source.unit, CompressedRows(source.scaled)
+        self.of_bounded = source.of_bounded
+        self.original = CompressedRows(csr_array(source.G.T))
+        self.matrix, self.factor = CompressedRows(source.matrix), source.factor
         self.has_border = source.has_border
         self.room = Room(2 * self.k + self.original.k + self.places)
         self.t, self.y = self.room.at, self.room.at + self.k
@@ -86,7 +87,8 @@ cdef class Coarse:
     cdef BorderedFactor in_face(self, double shift):
         """Return the factor of G_F G_Fᵀ + shift·GGᵀ; F: all components not `active`."""
         if self.has_border:
-            return self.factor.without(shift, self.of_bounded, self.active)
+            active = view(self.active, self.places)
+            return self.factor.shifted_without(shift, self.of_bounded, active)
         free = np.ones(self.n, dtype=bool)
         free[self.source.bounded] = view(self.active, self.places) == 0
         return self.source.factorised(free, shift)
@@ -102,13 +104,3 @@ cdef class Coarse:
         cdef Py_ssize_t i
         for i in range(self.places):
             self.active[i] = 1 - free[self.bounded[i]]
-
-
-cdef CompressedRows transposed_rows(G):
-    """Return the transpose of a sparse matrix."""
-    return CompressedRows.of_transpose(G if G.format == "csc" else csc_array(G))
-
-
-cdef CompressedRows symmetric_rows(M):
-    """Return a symmetric matrix M, dense or in CSC format, as compressed rows."""
-    return (CompressedRows.of_transpose if issparse(M) else CompressedRows.of_array)(M)

@@ -18,8 +18,8 @@ Python functions; the rest of the loop stays compiled.
 * release.pxi: proportioning in the inner loop with an incomplete factor
 * outer.pxi: the outer loop and the recovery of x and its multipliers
 
-tests/support/textbook contains the same algorithm in NumPy. Tests check that both
-versions take equal numbers of steps and reach the same points up to rounding.
+textbook.py contains the published algorithms in NumPy. Tests check that both solvers
+reach the same points and multipliers.
 
 P is dense (one triangle is read), sparse, a compiled linear map, or an operator called
 through Python. A sparse P with few nonzero diagonals, such as a difference or finite
@@ -50,7 +50,7 @@ from mortarbench.harness.distributed.sparse cimport (
 from sys import getrefcount
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, issparse
+from scipy.sparse import csr_array, issparse
 
 from mortarbench.harness import Status
 from mortarbench.harness.operators import linear_map

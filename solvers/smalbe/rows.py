@@ -25,11 +25,10 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, issparse
+from scipy.sparse import csc_array, csr_array, diags_array, issparse
 
 from mortarbench.harness import Matrix, Vector, too_large
 from mortarbench.harness.distributed.factor import (
-    MAX_ARRAY_ROWS,
     DependentRowsError,
     bordered_factor,
     independent_rows,
@@ -117,14 +116,12 @@ class SparseRows(Rows):
     """
 
     unit: CompressedRows  #: (n, r) transpose of the rows of G, divided by their norms
-    matrix: Matrix  #: GGᵀ of the normalised rows
+    scaled: csr_array  #: (r, n) the same rows
+    matrix: csr_array  #: GGᵀ of the normalised rows
     factor: BorderedFactor  #: Cholesky factor of `matrix`
     has_border: bool  #: False if the border would have more than `MAX_BORDER` rows
     bounded: NDArray[np.int64]  #: (b,) components with a bound
     of_bounded: CompressedRows  #: (b, r) rows of `unit` for these components
-
-    def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
-        return self.unit.combined(s, v, t, self.factor.backward(a))
 
     def factorised(self, free: Mask, shift: float) -> BorderedFactor:
         """Return a factor of G_F G_Fᵀ + shift·GGᵀ without a border; F is `free` (n,).
@@ -132,7 +129,8 @@ class SparseRows(Rows):
         The shift is increased if the sum is singular up to rounding.
         """
         none = np.zeros(0, dtype=np.int64)
-        of_free = _gram(self.unit, free)
+        part = self.scaled[:, np.flatnonzero(free)]
+        of_free = part @ part.T
         while True:
             try:
                 return bordered_factor(of_free + shift * self.matrix, none)
@@ -238,12 +236,15 @@ def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
     """Factorise GGᵀ of a sparse G (m, n); return None for linearly dependent rows."""
     b = np.flatnonzero(bounded)
     G = G if G.format == "csc" else csc_array(G)
-    unit, size = CompressedRows.of_transpose(G).unit_columns()
-    of_bounded = unit.rows(b)
-    changing = of_bounded.touched
+    size = np.sqrt(G.multiply(G).sum(axis=1))
     if not (size > 0).all():
         return None
-    gram, has_border = _gram(unit), int(changing.sum()) <= MAX_BORDER
+    scaled = csr_array(diags_array(1 / size) @ G)
+    columns = csr_array(scaled.T)
+    unit, of_bounded = CompressedRows(columns), columns[b]
+    changing = np.zeros(size.size, dtype=bool)
+    changing[of_bounded.indices] = True
+    gram, has_border = csr_array(scaled @ columns), int(changing.sum()) <= MAX_BORDER
     try:
         factor = bordered_factor(gram, np.flatnonzero(changing & has_border))
     except DependentRowsError:
@@ -259,26 +260,13 @@ def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
         consistent=True,
         multipliers=lambda a: factor.backward(a) / size,
         unit=unit,
+        scaled=scaled,
         matrix=gram,
         factor=factor,
         has_border=has_border,
         bounded=b,
-        of_bounded=of_bounded,
+        of_bounded=CompressedRows(of_bounded),
     )
-
-
-def _gram(unit: CompressedRows, columns: Mask | None = None) -> Matrix:
-    """Return G_F G_Fᵀ for the transpose `unit` (n, r) of G; dense for few rows of G.
-
-    columns : (n,) mask of F; None for all columns
-    """
-    n, r = unit.shape
-    if r <= MAX_ARRAY_ROWS:
-        weights = np.ones(n) if columns is None else columns.astype(float)
-        return unit.outer_products(weights, np.arange(r, dtype=np.int32), r)
-    G = unit.by_columns
-    part = G if columns is None else G[:, np.flatnonzero(columns)]
-    return csc_array(part @ part.T)
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:

@@ -16,8 +16,8 @@ spectral steps (mprgp.pxi).
 One part of this implementation is new: the Lanczos process that estimates the norm also
 yields the upper Ritz pairs. These pairs and C define a model of H (model.pxi). The
 model determines the steps that change the face, preconditions CG on the face, and
-permits a large ρ without loss of conditioning. The presets `PERMON`, `ESPRESO` and
-`PAPER` use the constants and step rules of PERMON, of ESPRESO and of the textbook.
+permits a large ρ without loss of conditioning. `solvers.smalbe.textbook` contains the
+published algorithms.
 """
 
 from __future__ import annotations
@@ -43,8 +43,7 @@ class SMALBE(Options):
     `tol` bounds ‖g^P‖/‖b‖, where g^P is the projected gradient of the projected
     problem, and ‖Gx − e‖/‖e‖. For QPs with bounds only and a known diagonal of P, the
     default options test the relative KKT residual instead. The solver claims a solution
-    only if the relative KKT residual of the original QP is also at most tol; for the
-    presets with published rules, at most 5·tol.
+    only if the relative KKT residual of the original QP is also at most tol.
     """
 
     about: ClassVar[About] = About(
@@ -99,49 +98,5 @@ class SMALBE(Options):
 
         return prepare
 
-
-#: constants and step rules of PERMON (docs/smalbe-options.md): MPRGP with the standard
-#: expansion and ᾱ = 2/‖H‖ from the power method, ρ = 1.1‖F‖, M = 100‖F‖
-PERMON = SMALBE(
-    expansion="std",
-    proportioning="cg",
-    preconditioner="none",
-    rho=1.1,
-    M=100.0,
-    reduced=False,
-    alpha=2.0,
-    norm="power",
-    eliminate="never",
-    energy=0.0,
-    recycle=False,
-)
-
-#: constants and step rules of ESPRESO: projected CG steps with a check of the cost,
-#: gradient projection as proportioning, all constants relative to ‖𝒫F𝒫‖
-ESPRESO = SMALBE(
-    expansion="mixed",
-    proportioning="model",
-    preconditioner="none",
-    rho=1.0,
-    beta=0.8,
-    eta=1.0,
-    alpha=2.0,
-    norm="power",
-    eliminate="never",
-    energy=0.0,
-    recycle=False,
-)
-
-#: constants and step rules of the textbook (the paper's reference [3]): Γ = 1, reduced
-#: free gradient, fixed ᾱ
-PAPER = SMALBE(
-    expansion="std",
-    proportioning="cg",
-    preconditioner="none",
-    rho=1.0,
-    eliminate="never",
-    energy=0.0,
-    recycle=False,
-)
 
 CONDENSED = SMALBE(eliminate="always")

@@ -90,7 +90,7 @@ def relative_residual(qp, s, double tol, Px, diagonal, G):
             add(y[i], row, r, n)
             row += n
     else:
-        by_components = transposed_rows(G)
+        by_components = CompressedRows(csr_array(G.T))
         for i in range(n):
             for j in range(by_components.indptr[i], by_components.indptr[i + 1]):
                 k = by_components.indices[j]

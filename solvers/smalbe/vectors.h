@@ -1,5 +1,4 @@
-/* Loops over vectors for MPRGP. `tests/support/textbook/kernels.py` contains the same
-   loops in NumPy.
+/* Loops over vectors for MPRGP.
 
    Each function is compiled twice, for processors with AVX2 and FMA and for all
    others; the loader selects the version. Conditions are written as conditional

@@ -9,7 +9,6 @@ from mortarbench.cli.main import main
 from mortarbench.harness import InputError
 from mortarbench.harness.errors import one_line, shown
 from mortarbench.harness.files.reading import VARIABLE, read_json, read_toml, toml
-from mortarbench.harness.limits import CASE_VARIABLE
 from mortarbench.harness.names import parse
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.journal import read_journal
@@ -145,20 +144,6 @@ def test_two_contradictory_lines_on_one_measurement_are_refused(journal):
     )
 
 
-def test_equal_tables_of_a_journal_are_shared_but_1_and_true_differ(journal):
-    a, b, c = read_journal(
-        journal(
-            record("a", options={"n": 1}),
-            record("b", options={"n": 1}, message="{'n': 1}", claimed="{'n': 1}"),
-            record("c", options={"n": True}),
-        )
-    )
-
-    assert a.options is b.options
-    assert b.claimed == "{'n': 1}"
-    assert c.options["n"] is True
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -244,25 +229,6 @@ def test_impossible_cases_are_refused_with_a_short_message(name):
     assert not any(letter * 201 in str(e.value) for letter in "9xyz")
 
 
-def test_minus_zero_is_zero():
-    with pytest.raises(InputError, match=r"load=0\.0 must be positive"):
-        parse("hertz-plane/load=-0/dual", PROBLEMS)
-    assert "-" not in str(parse("hertz-plane/n=+7/dual", PROBLEMS))[11:]
-
-
-def test_the_memory_limit_for_cases_can_be_raised(monkeypatch):
-    monkeypatch.setenv(CASE_VARIABLE, "0.5")
-    with pytest.raises(
-        InputError, match="or MORTARBENCH_CASE_MIB set to the memory available"
-    ):
-        parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
-    monkeypatch.setenv(CASE_VARIABLE, "1000")
-    assert parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS).params["Nr"] == 30
-    monkeypatch.setenv(CASE_VARIABLE, "-1")
-    with pytest.raises(InputError, match="expected a positive number of MiB"):
-        parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
-
-
 def test_a_message_is_one_line_of_limited_length_in_which_paths_fit(tmp_path):
     deep = tmp_path / ("d" * 200) / ("e" * 200)
     deep.mkdir(parents=True)
@@ -276,28 +242,3 @@ def test_a_message_is_one_line_of_limited_length_in_which_paths_fit(tmp_path):
     for _ in range(100_000):
         nested = [nested]
     assert shown(nested) == "a list too long to show"
-
-
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ("run", "/dev/zero"), ("run", "pipe"), ("run", "."), ("run", "x" * 5000),
-        ("run", "a\udcffb.toml"), ("report", "a\udcffb"), ("report", "/dev/null"),
-        ("solve", "beam-ring/Nr=" + "9" * 5000 + "/dual", "--solver", "osqp"),
-        ("solve", "beam-ring/Nr=4/dual", "--solver", "w" * 100_000),
-        ("solve", "beam-ring/Nr=4/dual", "--solver", "osqp", "--tol", "v" * 100_000),
-        ("solve", "beam-ring/Nr=4/dual", "--solver", "osqp", "--tol", "nan"),
-        ("report", ".", "--factor", "inf"), ("report", ".", "--format", "u" * 100_000),
-        ("replay", ".", ""), ("list", "t" * 9000),
-        ("s" * 100_000,), ("run", "demo", "--repeats", "9" * 5000),
-        ("run", "", "--out", ""),
-        ("run", "demo", "--repeats", "1000000000000"), ("run", "demo", "--case", "["),
-        ("run", "demo", "--memory-limit", "1e400"), ("run", "demo", "--solver", ""),
-    ],
-)  # fmt: skip
-def test_no_command_ends_with_a_traceback_or_a_long_message(refused, tmp_path, argv):
-    os.mkfifo(tmp_path / "pipe")
-
-    message = refused(*argv)
-
-    assert len(message) < 1500

@@ -11,7 +11,6 @@ import shutil
 import warnings
 from decimal import Decimal
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -346,59 +345,6 @@ ODD = (
     frozenset({"x"}), frozenset(), range(3), str, InputError, np.float64(0.5),
     np.int64(2), np.bool_(True), np.str_("x"), Decimal(1), Fraction(1, 3), ...,
 )  # fmt: skip
-#: functions, with positional and keyword arguments of valid types
-ENTRIES = (
-    (mb.build, ["obstacle/dim=1/n=4/primal"], {"plugins": ()}),
-    (mb.load, ["run"], {"warn": len}),
-    (mb.merge, ["run", "run"], {"out": "merged", "tell": len}),
-    (mb.problems, [], {"plugins": (), "registries": None}),
-    (mb.report, ["run", None], {
-        "formats": ("csv",), "factor": 10.0, "fail_on": (), "compare": (),
-        "pair": (), "registries": None,
-    }),
-    (mb.run, ["small.toml"], {
-        "out": "measured", "solvers": (), "cases": (), "repeats": 1, "time_limit": 60,
-        "memory_limit": 4096, "options": None, "fresh": False, "dask": None,
-        "plugins": (), "progress": False, "registries": None,
-    }),
-    (mb.solve, ["obstacle/dim=1/n=4/primal", "clarabel"], {
-        "tol": 1e-6, "options": None, "plugins": (), "ranks": 1, "max_iter": 50,
-    }),
-    (mb.solvers, [], {"plugins": (), "registries": None}),
-    (mb.suites, [], {"registries": None}),
-    (mb.validate, ["nowhere"], {
-        "plugins": (), "progress": len, "registries": None,
-    }),
-    (lambda path: mb.build("obstacle/dim=1/n=4/primal").save(path), ["qp.npz"], {}),
-)  # fmt: skip
-
-
-@COUNTS
-def test_odd_arguments_from_python_are_taken_or_refused(tmp_path, monkeypatch, count):
-    monkeypatch.chdir(tmp_path)
-    synthetic_results.write(tmp_path / "run", 1, 1, 1)
-    (tmp_path / "small.toml").write_text(
-        'name = "small"\nrepeats = 1\nsolvers = ["clarabel"]\n[[problems]]\n'
-        'family = "obstacle"\nforms = ["primal"]\nparams = { dim = 1, n = 4 }\n'
-    )
-    mb.run("small.toml", out="measured")
-    calls = [
-        (function, given, named, place, odd)
-        for function, given, named in ENTRIES
-        for place in (*range(len(given)), *named)
-        for odd in (*ODD, [], [3], ["x"], [[]], {}, {5: 5}, {"max_iter": object()})
-        if not (place == "dask" and isinstance(odd, str))
-    ]
-    random.Random(count).shuffle(calls)
-    assert len(calls) > MANY
-    for function, given, named, place, odd in calls[:count] if count == FEW else calls:
-        changed = dict(enumerate(given)) | named | {place: odd}
-        call = partial(
-            function,
-            *(changed[i] for i in range(len(given))),
-            **{name: changed[name] for name in named},
-        )
-        tried((function, place, odd), call)
 
 
 @COUNTS

@@ -62,13 +62,6 @@ def test_a_derived_default_follows_the_key_that_it_derives_from():
     assert (params["layers"], params["step"]) == (14, 3)
 
 
-def test_keys_are_always_in_the_order_of_the_family():
-    name = assemble("ring", RING, {"plane": "stress", "size": 2.0, "Nh": 8}, "primal")
-
-    assert list(name.params) == ["Nh", "layers", "steps", "step", "size", "plane"]
-    assert str(name) == "ring/Nh=8/size=2.0/plane=stress/primal"
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -143,20 +136,6 @@ def test_an_invalid_name_is_reported_in_one_line(text, message):
     assert "\n" not in str(e.value)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("Nh", 3.0), ("Nh", True), ("size", True), ("plane", 3)]
-)
-def test_a_typed_value_of_another_type_is_refused(key, value):
-    with pytest.raises(InputError, match=f"ring: {key}={value}; expected "):
-        assemble("ring", RING, {key: value}, "dual")
-
-
-def test_an_integer_is_accepted_if_the_default_is_a_float():
-    size = assemble("ring", RING, {"size": 2}, "dual").params["size"]
-
-    assert (size, type(size)) == (2.0, float)
-
-
 def test_patterns_are_shell_globs_over_the_whole_name_with_case():
     names = ["ring/Nh=3/dual", "ring/Nh=13/dual", "ring/Nh=3/primal"]
 
@@ -202,12 +181,6 @@ def test_the_error_for_a_path_names_the_case_of_the_file(
         parse(text, families)
     head = text.partition("/")[0]
     assert str(e.value) == f"unknown family {head!r}; did you mean {named!r}, a file?"
-
-
-@pytest.mark.parametrize("text", ["missing", "ring/n=0.5e3/dual", "a.5/dual"])
-def test_a_name_that_is_not_a_path_is_an_unknown_family(text):
-    with pytest.raises(InputError, match="; known: file"):
-        parse(text, {"file": Stored()})
 
 
 @pytest.mark.parametrize("text", ["meshed:a/b.toml", "meshed:a/b.toml/qp"])

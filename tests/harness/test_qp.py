@@ -45,12 +45,6 @@ def test_a_scalar_bounds_every_variable_and_a_vector_is_one_row():
     assert (qp.G.tolist(), qp.h.tolist()) == ([[1, 2]], [3])
 
 
-def test_single_columns_and_rows_become_vectors():
-    qp = QP.from_arrays(I2, [[1.0], [2.0]], lb=np.zeros((1, 2)))
-
-    assert (qp.q.tolist(), qp.lb.tolist()) == ([1, 2], [0, 0])
-
-
 @pytest.mark.parametrize("kind", [np.array, csc_matrix])
 def test_the_passed_arrays_stay_writable_and_are_copied(kind):
     P, q = kind(I2), np.ones(2)
@@ -59,12 +53,6 @@ def test_the_passed_arrays_stay_writable_and_are_copied(kind):
 
     assert qp.P.diagonal().tolist() == [1, 1]
     assert qp.q.tolist() == [1, 1]
-
-
-def test_duplicate_entries_are_summed():
-    twice = coo_array(([1.0, 1.0, 1.0], ([0, 0, 1], [0, 0, 1])), shape=(2, 2))
-
-    assert QP.from_arrays(twice, ZERO).P.toarray().tolist() == [[2, 0], [0, 1]]
 
 
 def test_a_qp_shows_its_sizes():
@@ -151,22 +139,6 @@ def test_a_problem_of_qpsolvers_has_the_same_parts():
         assert getattr(qp, name).tolist() == parts[name].tolist()
     assert (qp.P.tolist(), qp.A.tolist()) == (I2.tolist(), [[1, -1]])
     assert (qp.G.toarray().tolist(), qp.ub.tolist()) == ([[1, 1]], [np.inf] * 2)
-
-
-def test_a_problem_of_cvxpy_has_the_same_minimum():
-    """The point of the line x₁ + x₂ = 1 with x₁ ≥ 0.7 nearest to (1, 2) is (0.7, 0.3):
-    its squared distance is 0.3² + 1.7² = 2.98.
-    """
-    x, level = cvxpy.Variable(2), cvxpy.Parameter(value=0.7)
-    rows = [cvxpy.sum(x) == 1, x[0] >= level]
-    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(x - [1, 2])), rows)
-    qp = QP.from_cvxpy(problem)
-    s = qpsolvers.solve_qp(
-        *(csc_matrix(M) if M.ndim == 2 else M for M in (qp.P, qp.q, qp.G, qp.h)),
-        csc_matrix(qp.A), qp.b, solver="clarabel",
-    )  # fmt: skip
-
-    assert qp.objective(s) == pytest.approx(2.98, abs=1e-6)
 
 
 @pytest.mark.parametrize("reason", ["concave", "cone", "integer", "no value"])

@@ -365,20 +365,6 @@ def test_modules_beside_a_plugin_replace_no_loaded_module(tmp_path):
     assert list(load_plugin(file).solvers) == ["mine", "mine-9"]
 
 
-def test_a_traceback_of_a_plugin_names_its_lines(tmp_path):
-    (tmp_path / "late.py").write_text("import json, os\n\n1 / 0")
-    file = tmp_path / "plug.py"
-    file.write_text(PLUGIN.replace("return None", "\n        import late"))
-    mine = load_plugin(file).solvers["mine"]
-
-    with pytest.raises(ZeroDivisionError) as e:
-        mine.declines(None)
-
-    places = [(t.path.name, t.lineno + 1) for t in e.traceback]
-    assert ("plug.py", 9) in places
-    assert places[-1] == ("late.py", 3)
-
-
 @pytest.mark.parametrize(
     "changed", ["mine.py", "helper.py", "constants.py", "late.py", "tools/speed.py"]
 )
@@ -412,19 +398,6 @@ def test_a_label_precedes_the_path_of_a_plugin(text, path, label, name):
     assert PluginFile.of(str(file.resolved())) == file.resolved()
 
 
-def test_a_labelled_plugin_may_contain_an_adapter_of_several_backends(tmp_path):
-    file = tmp_path / "many.py"
-    file.write_text(
-        PLUGIN.replace("tries: int = 3", "backend: str = ''").replace(
-            'Mine(), "mine-9": Mine(9)}', 'Mine("own"), "mine:*": Mine()}'
-        )
-    )
-    solvers = load_plugin(f"new={file}").solvers
-
-    assert resolve(spec("new:mine:scs"), solvers).backend == "scs"
-    assert resolve(spec("new:mine"), solvers).backend == "own"
-
-
 @dataclass(frozen=True)
 class Wide:
     rho: float = 1  # an int, as users may write
@@ -432,14 +405,6 @@ class Wide:
     norm: Literal["max", 2] = "max"
     weight: float | None = 1
     start: Any = 0
-
-    declines, prepare = Method.declines, Method.prepare
-
-
-@dataclass(frozen=True)
-class Lost:
-    rho: float = 1.0
-    inner: "NameForTypeCheckers | None" = None  # noqa: F821
 
     declines, prepare = Method.declines, Method.prepare
 
@@ -456,12 +421,10 @@ def test_the_annotation_of_an_option_decides_its_type(default, value):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"rho": "much"}, "rho = 'much' is of type str; expected float"),
-        ({"rho": True}, "rho = True is of type bool; expected float"),
-        ({"steps": 9.5}, "steps = 9.5 is of type float; expected int"),
-        ({"norm": 1.5}, "norm = 1.5 is of type float; expected str or int"),
-        ({"weight": "no"}, "weight = 'no' is of type str; expected float or None"),
-        ({"start": 0.5}, "start = 0.5 is of type float; expected int"),
+        ({"rho": "much"}, "rho = 'much'; expected a number"),
+        ({"rho": True}, "rho = True; expected a number"),
+        ({"norm": 1.5}, "norm = 1.5; expected max or 2"),
+        ({"start": 0.5}, "start = 0.5; expected an integer"),
     ],
 )
 def test_a_value_of_another_type_than_annotated_is_refused(options, message):
@@ -469,11 +432,3 @@ def test_a_value_of_another_type_than_annotated_is_refused(options, message):
         resolve(spec("wide", **options), {"wide": Wide()})
 
     assert str(refused.value) == f"wide: {message}"
-
-
-def test_defaults_determine_types_if_annotations_cannot_be_read():
-    lost = {"lost": Lost()}
-
-    assert resolve(spec("lost", rho=0.5), lost).rho == 0.5
-    with pytest.raises(InputError, match="rho = 'much' is of type str; expected float"):
-        resolve(spec("lost", rho="much"), lost)

@@ -17,10 +17,7 @@ from mortarbench.harness import (
     Status,
     save_qp,
 )
-from mortarbench.harness.conformance.metamorphic import change_units, permute_unknowns
 from mortarbench.harness.files.qpfile import qp_digest
-from mortarbench.harness.verify.infeasibility import certificate_of
-from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import SolverError, reason_to_decline
 from tests.support.balls import Balls
 
@@ -206,38 +203,6 @@ def test_invalid_blocks_of_sets_are_refused_in_one_line(make, message):
     assert "\n" not in str(e.value)
 
 
-@names
-def test_slack_is_compared_with_the_size_of_its_terms(one, rng):
-    for x in points(rng, 20):
-        for limit in one.limits(x):
-            assert (np.abs(limit.slack) <= limit.size + limit.terms + 1e-15).all()
-            assert np.isin(limit.variable, one.block).all()
-
-
-@pytest.mark.parametrize("one", SETS[2:], ids=NAMES[2:])
-@pytest.mark.parametrize("is_directed", [False, True])
-def test_normals_of_discs_and_cones_support_the_set(one, rng, is_directed):
-    """A plane with normal n touches the set: nᵀy ≤ nᵀx + slack for all members y."""
-    members = [one.project(y) for y in points(rng, 100)]
-    for v in points(rng, 50):
-        x = one.project(v)
-        force = [v - x] if is_directed and isinstance(one, Cones) else []
-        normals, slack = one.normals(x, *force)
-        assert (slack >= -1e-14).all()
-        assert (normals.power(2).sum(axis=0) <= 1 + 1e-14).all()
-        for y in members:
-            assert (normals.T @ (y - x) <= slack + 1e-12).all()
-
-
-def test_a_box_is_substituted_with_its_variables(rng):
-    order, factors = rng.permutation(N), rng.choice([-2.0, 0.5, 4.0], N)
-    T = csr_array((factors, (np.arange(N), order)), shape=(N, N))
-    a = rng.standard_normal(N)
-    other = BOX.substituted(T, a)
-    for x in points(rng, 50):
-        assert T @ other.project(x) + a == pytest.approx(BOX.project(T @ x + a))
-
-
 # QPs
 
 
@@ -294,101 +259,6 @@ def test_a_box_among_the_sets_of_from_arrays_is_refused():
     ):
         QP.from_arrays(**arrays, sets=(BOX,))
     assert QP.from_arrays(**arrays, sets=(BALLS,)).sets[1] is BALLS
-
-
-def with_solution(seed, radius=None):
-    """Return a QP with bounds, rows and balls, and its strictly complementary solution.
-
-    Balls 0, 2, … are active, with z = c·x and c > 0 if the radius is positive; balls
-    1, 3, … are inactive.
-    """
-    rng = np.random.default_rng(seed)
-    k, d, m = 5, int(rng.integers(1, 4)), 2
-    n = k * d + 6
-    index = rng.permutation(n)[: k * d].reshape(k, d)
-    radius = rng.exponential(size=k) + 0.1 if radius is None else radius
-    x, z = rng.standard_normal((2, n))
-    z *= 0
-    for i, (block, r) in enumerate(zip(index, radius, strict=True)):
-        direction = rng.standard_normal(d)
-        direction /= np.linalg.norm(direction)
-        x[block] = direction * r * (1 if i % 2 == 0 else rng.uniform(0, 0.9))
-        z[block] = direction * (rng.exponential() + 0.1) * (i % 2 == 0)
-    alone = np.setdiff1d(np.arange(n), index)
-    lb, ub = np.full(n, -INF), np.full(n, INF)
-    lb[alone[:2]], z[alone[:2]] = x[alone[:2]], -1.0
-    M = rng.standard_normal((n, n))
-    P, A, G = M @ M.T / n + 0.1 * np.eye(n), *rng.standard_normal((2, m, n))
-    y, mu = rng.standard_normal(m), np.array([0.7, 0.0])
-    q = -(P @ x + A.T @ y + G.T @ mu + z)
-    qp = QP(
-        P=P, q=q, A=A, b=A @ x, G=G, h=G @ x + [0, 1], lb=lb, ub=ub,
-        sets=(Balls(index, radius),),
-    )  # fmt: skip
-    return qp, Solution(status=Status.SOLVED, x=x, y=y, z=mu, z_box=z)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_only_the_planted_solution_has_zero_residuals(seed):
-    qp, s = with_solution(seed)
-    index, radius = qp.sets[1].index, qp.sets[1].radius
-
-    assert kkt_residuals(qp, s).worst <= 1e-14
-    first = index[0]
-    wrong_sign = s.z_box.copy()
-    wrong_sign[first] *= -1
-    assert kkt_residuals(qp, replace(s, z_box=wrong_sign)).worst > 1e-2
-    inside = s.z_box.copy()
-    inside[index[1]] = 0.3 * np.linalg.norm(s.z_box[first])
-    q = qp.q - inside + s.z_box  # makes the point stationary
-    r = kkt_residuals(replace(qp, q=q), replace(s, z_box=inside))
-    assert r.complementarity > 1e-5
-    assert r.dual <= 1e-14
-    outside = s.x.copy()
-    outside[first] *= 1.01
-    assert kkt_residuals(qp, replace(s, x=outside)).primal > 1e-5
-    assert radius[0] == pytest.approx(np.linalg.norm(s.x[first]))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_equivalent_qps_with_balls_have_the_same_residuals(seed):
-    qp, s = with_solution(seed)
-    order = np.random.default_rng(seed).permutation(qp.q.size)
-    new = change_units(qp, unknown=8.0, objective=2.0).followed_by(
-        lambda other: permute_unknowns(other, order)
-    )
-    x, z_box = s.x[order] / 8, s.z_box[order] * 16
-    assert new.qp.sets[1].radius == pytest.approx(qp.sets[1].radius / 8)
-    there = replace(s, x=x * 1.001, z_box=z_box, y=16 * s.y, z=16 * s.z)
-    here = new.recover(there)
-
-    assert here.x == pytest.approx(s.x * 1.001)
-    assert (*here.y, *here.z) == pytest.approx((*s.y, *s.z))
-    assert here.z_box == pytest.approx(s.z_box)
-    after, before = kkt_residuals(new.qp, there), kkt_residuals(qp, here)
-    assert after == pytest.approx(before, rel=1e-6, abs=1e-14)
-
-
-def test_any_vector_is_normal_to_a_ball_of_radius_zero(rng):
-    qp, s = with_solution(3, radius=np.zeros(5))
-    z = s.z_box.copy()
-    z[qp.sets[1].index] = rng.standard_normal(qp.sets[1].index.shape)
-    moved = replace(qp, q=qp.q + s.z_box - z)
-
-    assert kkt_residuals(moved, replace(s, z_box=z)).worst <= 1e-14
-
-
-def test_a_row_that_no_point_of_a_ball_satisfies_is_infeasible():
-    """On the unit disc, x₁ + x₂ ≤ √2; its bounding box contradicts x₁ + x₂ ≥ 3."""
-    balls = Balls(np.array([[0, 1]]), np.ones(1))
-    qp = QP(
-        P=np.eye(2), q=np.zeros(2), A=np.zeros((0, 2)), b=np.zeros(0),
-        G=-np.ones((1, 2)), h=np.array([-3.0]), sets=(balls,),
-    )  # fmt: skip
-    claim = Solution.without_point(qp, Status.INFEASIBLE)
-
-    assert certificate_of(qp, claim, 1e-8)[0]
-    assert not certificate_of(replace(qp, h=np.array([-1.4])), claim, 1e-8)[0]
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -15,14 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mortarbench import progress
 from mortarbench.cli.main import COMMANDS, command_parser, main
-from mortarbench.harness import Verdict
 from mortarbench.harness.files.qpfile import load_qp
-from mortarbench.harness.names import parse
-from mortarbench.harness.registry import SolverSpec, load_plugin
+from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.journal import Journal, read_journal
-from mortarbench.harness.verify.verdicts import new_record
 from mortarbench.progress import display_on
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
@@ -92,10 +87,6 @@ def test_solvers_are_listed_one_line_each(cli):
     assert "Lost(" not in out  # dataclass wrote this as the docstring
 
 
-def test_suites_are_listed_with_their_purpose(cli):
-    assert cli("list", "suites") == (0, "tiny  For tests.\n", "")
-
-
 @pytest.mark.parametrize(
     ("what", "expected"),
     [
@@ -158,14 +149,6 @@ def test_the_requested_tolerance_determines_the_verdict(cli):
     assert [cli(*command, tol)[0] for tol in ("1e-6", "1e-2")] == [1, 0]
 
 
-def test_a_solver_receives_the_tolerance(cli):
-    _, out, _ = cli(
-        "solve", "well/n=1/primal", "--solver", "lax", "--tol", "0.1", "--json"
-    )
-
-    assert json.loads(out)["quantities"]["tip"] == [pytest.approx(1.1)]
-
-
 def test_a_solver_that_declines_exits_with_1_and_its_reason_on_stderr(cli):
     assert cli("solve", "well/primal", "--solver", "picky") == (
         1, "", "mortarbench: picky declines well/primal: never on a Monday\n"
@@ -209,17 +192,6 @@ def test_an_exported_qp_is_the_emitted_qp_with_the_name_of_its_case(cli, tmp_pat
     assert (meta["scale"], meta["constant"]) == (2.0, 0.0)
 
 
-def test_report_names_the_files_that_it_wrote(cli, tmp_path):
-    (tmp_path / "folder").mkdir()
-    code, out, _ = cli("report", "folder", "--format", "md,tex", "--verbose")
-
-    assert (code, out.splitlines()) == (
-        0,
-        ["folder/index.md", "folder/index.tex"],
-    )
-    assert len(cli("report", "folder", "--verbose")[1].splitlines()) == 5
-
-
 @pytest.mark.parametrize(
     ("formats", "printed"),
     [("md,html,csv", "index.html"), ("csv,md", "index.md"), ("csv,tex", "")],
@@ -234,27 +206,12 @@ def test_report_prints_the_main_path_only(cli, tmp_path, formats, printed):
     assert len(out.splitlines()) == 1
 
 
-def test_report_applies_the_requested_factor(cli, tmp_path):
-    (tmp_path / "folder").mkdir()
-    assert cli("report", "folder", "--format", "md", "--factor", "2.5") == (
-        0, "folder/index-2.5.md\n", "",
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("factor", ["0", "-1", "nan", "inf"])
 def test_a_factor_that_is_not_positive_is_refused(cli, factor):
     code, out, err = cli("report", "folder", "--factor", factor)
 
     assert (code, out) == (2, "")
     assert f"--factor = {float(factor)}; expected a positive number" in err
-
-
-def test_doctor_describes_the_machine(cli):
-    code, out, _ = cli("doctor")
-
-    assert code == 0
-    assert "numpy" in out
-    assert ("→" in out) == ("to change" in out)
 
 
 def test_doctor_prints_the_same_as_json(cli):
@@ -322,17 +279,6 @@ def test_a_solver_that_ignores_interrupts_ends_with_the_command(tmp_path):
     assert not is_alive(int(started.read_text()))
 
 
-def test_output_of_a_plugin_is_not_mixed_with_results(cli, pit):
-    code, out, err = cli(
-        "solve", "pit/primal", "--solver", "times", "--plugin", "plug.py", "--json"
-    )
-
-    assert (code, json.loads(out)["status"]) == (0, "verified")
-    assert out.count("\n") == 1
-    assert "a plug-in says hello" in err
-    assert "a family says hello" in err
-
-
 @pytest.mark.slow
 def test_every_command_prints_only_json_even_if_a_library_in_c_prints(pit, tmp_path):
     """A library may print on the file descriptor 1 of the process of the command."""
@@ -375,16 +321,6 @@ def test_closed_streams_do_not_matter(closed):
     done = subprocess.run(command, shell=True, capture_output=True, check=False)
 
     assert (done.returncode, done.stderr) == (0, b"")
-
-
-def test_missing_numbers_and_inapplicable_units_are_not_shown(cli):
-    lost = cli("solve", "well/primal", "--solver", "lost")[1]
-    dual = cli("solve", "well/dual", "--solver", "exact")[1]
-
-    assert "nan" not in lost.lower()
-    assert "residual" not in lost
-    assert "energy                    -3\n" in dual
-    assert "J/m" not in dual
 
 
 def test_a_closed_output_pipe_is_not_an_error():
@@ -436,44 +372,14 @@ SOLVE = ("solve", "well/primal", "--solver", "exact")
 WRONG = {
     "no command": ((), "the following arguments are required: COMMAND; usage: morta"),
     "unknown command": (("rnu",), "unknown command 'rnu'; did you mean 'run'? known: "),
-    "unknown list": (
-        ("list", "sovlers"),
-        "unknown kind 'sovlers'; did you mean 'solvers'? ",
-    ),
     "unknown option": (
         ("run", "tiny", "--repeat", "3"),
         "unknown argument '--repeat'; did you mean --repeats? usage: mortarbench run ",
     ),
-    "misspelt option": (
-        ("solve", "well/primal", "--solvr=exact"),
-        "unknown argument '--solvr'; did you mean --solver? usage: mortarbench solve ",
-    ),
-    "option like no other": (
-        ("solve", "well/primal", "--zzz", "--solver", "exact"),
-        "unknown argument '--zzz'; usage: mortarbench solve ",
-    ),
-    "unknown option of no command": (("--versoin",), "argument"),
-    "no integer": (
-        ("run", "tiny", "--repeats", "x"),
-        "argument --repeats: invalid int",
-    ),
     "no solver": (("solve", "well/primal"), "arguments are required: --solver"),
-    "unknown solver": (
-        ("solve", "well/primal", "--solver", "exat"),
-        "unknown solver 'exat'; did you mean 'exact'? known: dies, exact, hang",
-    ),
     "unknown family": (
         ("solve", "wel/primal", "--solver", "exact"),
         "unknown family 'wel'; did you mean 'well'? known: well",
-    ),
-    "tolerance": ((*SOLVE, "--tol", "2"), "--tol = 2.0; expected a number between 0"),
-    "picture format": (
-        (*SOLVE, "--plot", "a.txt"),
-        "unknown format '.txt'; expected .",
-    ),
-    "scale without picture": (
-        (*SOLVE, "--scale", "3"),
-        "--scale 3 without --plot; expected --plot FILE",
     ),
     "scale": (
         (*SOLVE, "--plot", "a.pdf", "--scale", "nan"),
@@ -482,10 +388,6 @@ WRONG = {
     "picture nowhere": (
         (*SOLVE, "--plot", "no/a.png"),
         "no/a.png: the folder no does not exist; expec",
-    ),
-    "picture a folder": (
-        (*SOLVE, "--plot", "dir.png"),
-        "dir.png is a folder; expected",
     ),
     "out of range": (
         ("solve", "well/depth=97/primal", "--solver", "exact"),
@@ -499,10 +401,6 @@ WRONG = {
     "plug-in that cannot build": (
         ("export", "deeper/depth=99/primal", "a.npz", "--plugin", "deeper.py"),
         "deeper.py: deeper/depth=99/primal could not be built: ZeroDivisionError: a fa",
-    ),
-    "plug-in that builds nothing": (
-        ("export", "nothing/primal", "a.npz", "--plugin", "deeper.py"),
-        "deeper.py: nothing/primal could not be built: TypeError: build returned None",
     ),
     "nowhere to write": (("run", "tiny", "--out", ""), "--out is empty; expected a"),
     "nothing to draw": (
@@ -529,33 +427,9 @@ WRONG = {
         (*SOLVE, "--plugin", "taken.py"),
         "taken.py: solver 'exact' of the plug-in already exists; rename the new one",
     ),
-    "missing suite": (
-        ("run", "gone.toml"),
-        "gone.toml: no such file; expected a suite",
-    ),
     "unknown suite": (
         ("run", "tinny"),
         "unknown suite 'tinny'; did you mean 'tiny'? known: tiny",
-    ),
-    "malformed suite": (
-        ("run", "bad.toml"),
-        "bad.toml: line 1, column 8: Invalid value",
-    ),
-    "repeats": (
-        ("run", "tiny", "--repeats", "0"),
-        "--repeats = 0; expected an integer",
-    ),
-    "time limit": (
-        ("run", "tiny", "--time-limit", "0"),
-        "--time-limit = 0.0; expected ",
-    ),
-    "solver of run": (
-        ("run", "tiny", "--solver", "exat"),
-        "--solver: unknown solver 'ex",
-    ),
-    "folder of paper": (
-        ("paper", "--out", "bad.toml"),
-        "--out bad.toml: File exists; expected a folder",
     ),
     "pattern of run": (
         ("run", "tiny", "--case", "*/duel"),
@@ -726,21 +600,6 @@ def test_a_fresh_run_deletes_the_contents_of_the_folder(cli, pit):
     assert [r.solver for r in read_journal(Path("here"))] == ["twice"]
 
 
-def test_a_case_that_cannot_be_built_is_reported_and_retried_later(cli, pit, tmp_path):
-    suite = tmp_path / "pit.toml"
-    suite.write_text(suite.read_text().replace("[2, 3]", "[99, 2]"))
-    line = "pit/n=99/primal could not be built: ZeroDivisionError: no bottom"
-
-    runs = [cli(*pit), cli(*pit)]
-
-    for code, out, err in runs:
-        assert code == 1
-        assert "1 case could not be built: pit/n=99/primal\n" in out
-        assert err.count(line) == 1
-        assert "Traceback" not in err
-    assert {r.case for r in read_journal(Path("out/pit"))} == {"pit/n=2/primal"}
-
-
 def test_a_plugin_that_changed_is_another_environment(cli, pit, tmp_path):
     narrow = ("--solver", "times", "--case", "pit/n=2/*", "--repeats", "1")
     first = cli(*pit, *narrow)[0]
@@ -788,111 +647,11 @@ def test_on_a_terminal_a_run_shows_a_bar_with_its_activity(monkeypatch):
     assert "osqp on [red]/primal" in terminal.getvalue()
 
 
-@pytest.mark.parametrize("width", [100, 80, 60, 59, 30])
-def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
-    """The run has completed 1000 measurements, and the running case has a long name."""
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", str(width))
-    now = [0.0]
-    monkeypatch.setattr(progress, "monotonic", lambda: now[0])
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True
-    case = "beam-ring/Nr=30/Nh=15/step=7/contact=mortar/basis=standard/dual"
-    record = new_record(
-        parse("well/n=2/primal", FAMILIES),
-        SolverSpec(name="exact", label="exact"),
-        options={}, tol=1e-8, repeat=0, environment="here",
-    ).replace(status=Verdict.VERIFIED)  # fmt: skip
-
-    with display_on(terminal) as bar:
-        bar.start(1234)
-        for _ in range(1000):
-            bar.advance(None)
-        bar.say(f"{case}, tol 1e-08, repeat 3")
-        now[0] = 100.0
-        bar.advance(record)
-        terminal.truncate(terminal.seek(0))
-
-    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", terminal.getvalue())
-    lines = [line for line in re.split(r"[\r\n]+", shown) if line.strip()]
-    assert lines
-    assert all(len(line) <= width for line in lines)
-    assert all("1001/1234 6:28:20 left beam" in line for line in lines)
-
-
-def test_the_module_is_the_same_command_from_any_folder(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "mortarbench", "list", "suites"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-
-    assert [line.split()[0] for line in done.stdout.splitlines()] == [
-        "accuracy", "crossover", "crossval", "demo", "discs", "fclib", "finite-strain",
-        "fleet", "friction", "large", "paper", "paper-accuracy",
-        "paper-fleet", "path", "ranks", "scaling", "scaling-feti", "smoke", "solids",
-    ]  # fmt: skip
-
-
-def test_the_registries_are_not_changed_by_plugins(registries, tmp_path):
-    (tmp_path / "plug.py").write_text(PLUGIN)
-    before = replace(registries)
-
-    extended = registries.with_files([tmp_path / "plug.py"])
-
-    assert set(extended.solvers) == {*SOLVERS, "times"}
-    assert set(extended.families) == {"well", "pit"}
-    assert registries == before
-
-
 def test_a_complete_quiet_run_prints_nothing(cli):
     assert cli("run", "tiny", "--quiet") == (0, "", "")
     code, out, err = cli("run", "tiny", "--quiet", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["solvers"]["exact"] == {"verified": 6}
-
-
-def test_a_quiet_run_prints_warnings_and_missing_measurements(
-    cli, monkeypatch, tmp_path
-):
-    monkeypatch.setattr(os, "getloadavg", lambda: (99.0, 99.0, 99.0))
-    (tmp_path / "s.toml").write_text(
-        "name = 's'\nsolvers = ['lost']\n[[problems]]\nfamily = 'well'\n"
-        "forms = ['primal']\n"
-    )
-    code, out, err = cli("run", "s.toml", "--quiet", "--strict", "--repeats", "1")
-
-    assert code == 1
-    assert out.startswith("strict: 1 measurement without an answer (lost on well/pri")
-    assert err.count("\n") == 1
-    assert "other programs keep 99.0 cores busy" in err
-
-
-def test_a_decline_names_the_dual_form_if_available(capsys, tmp_path, monkeypatch):
-    """A QP of a file has no dual form."""
-    from mortarbench import QP, export
-
-    monkeypatch.chdir(tmp_path)
-    case = "beam-ring/Nr=2/Nh=2/steps=1"
-
-    def declined(name, solver):
-        assert main(Registries(), ["solve", name, "--solver", solver]) == 1
-        return capsys.readouterr().err
-
-    assert f"dualise inequality rows first: solve {case}/dual\n" in declined(
-        f"{case}/primal", "smalbe"
-    )
-    export(QP.from_arrays([[1.0]], [0.0], G=[[1.0]], h=[1.0]), "a.npz")
-    assert declined("file:a.npz", "smalbe") == (
-        "mortarbench: smalbe declines file:a.npz: accepts bounds and equality rows, "
-        "but no inequality rows\n"
-    )
-    sliding = "greco/n=2/dim=3"  # friction on cones, and on discs in the dual
-    message = declined(f"{sliding}/primal", "smalbe")
-    assert "sets of the class Cones" in message
-    assert message.endswith(f"solve {sliding}/dual\n")
 
 
 def test_the_dual_that_a_decline_names_is_solved(capsys):

@@ -10,13 +10,9 @@ import cvxpy
 import numpy as np
 import pytest
 import qpsolvers
-from scipy.sparse import csc_array
 
 import mortarbench as mb
-from mortarbench.harness import plugin
-from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.registries import Registries
-from tests.support import TOY_PROBLEM
 from tests.support.active_row import QP, ActiveRow, Hangs
 
 pytestmark = pytest.mark.together
@@ -128,17 +124,6 @@ def test_an_option_that_is_not_json_is_refused(tmp_path):
         mb.InputError, match=r"free: options {'guess': <object .*expecte"
     ):
         mb.solve(QP, "free", plugins=[file], guess=object())
-
-
-def test_options_of_a_named_solver_may_be_keywords():
-    assert mb.solve(QP, "clarabel", max_iter=7).record.options["max_iter"] == 7
-
-
-def test_a_solver_object_solves_a_case_of_a_plug_in():
-    case = mb.build("well/n=2/dual", plugins=[TOY_PROBLEM])
-
-    assert mb.solve(case, ActiveRow()).verdict is mb.Verdict.DECLINED
-    assert mb.solve(QP, "lost", plugins=[TOY_PROBLEM]).verdict is mb.Verdict.FAILED
 
 
 SCRIPT = """
@@ -257,18 +242,6 @@ def test_a_solver_whose_copy_fails_has_crashed_with_the_reason():
     assert "cannot be rebuilt in a worker process: ValueError" in answer.record.message
 
 
-def test_a_series_of_load_steps_is_written_for_a_solver_of_a_plug_in(tmp_path):
-    """The series requires the solver of the plug-in again, for the first load step."""
-    plugin_file = tmp_path / "clara.py"
-    plugin_file.write_text(
-        "from solvers import SOLVERS as ALL\nSOLVERS = {'clara': ALL['clarabel']}\n"
-    )
-    name = "beam-ring/Nr=2/Nh=2/steps=2/step=2/dual"
-    answer = mb.solve(mb.build(name), "clara", plugins=[plugin_file])
-
-    assert answer.save_vtu(tmp_path / "a.pvd").is_file()
-
-
 # Verification of given points.
 
 
@@ -338,43 +311,6 @@ def test_a_check_ends_at_its_time_limit_and_the_next_one_is_run():
 # Exports.
 
 
-@pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
-def test_a_case_and_a_worker_have_the_same_matrices(form, tmp_path):
-    """Sparse matrices are csc_array; OSQP requires 32-bit indices."""
-    built = mb.build(f"beam-ring/Nr=4/Nh=3/steps=1/{form}").qp
-    save_qp(tmp_path / "qp.npz", built, serialised=True)
-    mapped, _ = load_qp(tmp_path / "qp.npz", operators={})
-    for name in "PGA":
-        M, other = getattr(built, name), getattr(mapped, name)
-        assert type(M) is type(other)
-        if not isinstance(M, np.ndarray):
-            assert type(M) is csc_array
-            for part in ("data", "indices", "indptr"):
-                mine, its = getattr(M, part), getattr(other, part)
-                assert mine.dtype == its.dtype
-                assert np.array_equal(mine, its)
-                assert mine.flags.writeable is its.flags.writeable
-            assert not M.data.flags.writeable
-            assert M.indices.dtype == M.indptr.dtype == np.int32
-            assert M.has_canonical_format
-
-
-def test_a_case_and_its_qp_have_the_same_solution():
-    case = mb.build("beam-ring/Nr=4/Nh=3/steps=1/primal")
-    by_name, by_qp = mb.solve(case, "clarabel"), mb.solve(case.qp, "clarabel")
-
-    assert by_qp.solution.x.tolist() == by_name.solution.x.tolist()
-
-
-def test_the_matrix_of_an_operator_is_its_product_with_the_identity():
-    qp = mb.build("membranes/S=2/n=4/dual").qp
-    P = qp.P @ np.eye(qp.q.size)
-
-    assert not qp.is_explicit
-    assert np.abs(P - P.T).max() <= 1e-12 * np.abs(P).max()
-    assert np.linalg.eigvalsh(P)[0] >= -1e-10 * np.abs(P).max()
-
-
 @pytest.mark.parametrize(
     ("what", "ending"),
     [
@@ -392,13 +328,6 @@ def test_the_exported_qp_is_the_same_qp(tmp_path, monkeypatch, what, ending):
 
     assert back.objective(x) == pytest.approx(qp.objective(x), rel=1e-12)
     assert back.sizes == qp.sizes
-
-
-def test_matrices_in_an_npz_have_32_bit_indices(tmp_path):
-    with np.load(
-        mb.export(SMALL.replace("dual", "primal"), tmp_path / "a.npz")
-    ) as file:
-        assert file["P_indices"].dtype == file["G_indptr"].dtype == np.int32
 
 
 # Suites, figures, replays, conformance.
@@ -512,38 +441,6 @@ def test_the_conformance_suite_accepts_a_solver_object():
 # Names.
 
 
-def test_completion_lists_public_names_only():
-    assert dir(mb) == sorted(mb.__all__)
-    assert not [name for name in dir(mb) if name.startswith("_")]
-
-
-def test_the_public_names_suffice_for_plug_ins(tmp_path):
-    assert {"QP", "Solution", "Status", "Family", "Case"} <= set(dir(mb))
-    assert mb.Case is plugin.Case
-    case = mb.build("obstacle/dim=1/n=4/primal")
-    assert isinstance(case, mb.Case)
-    assert (case.scale, case.constant) == (
-        case.family_case.scale,
-        case.family_case.constant,
-    )
-    file = tmp_path / "mine.py"
-    file.write_text(
-        "from dataclasses import dataclass\n"
-        "from mortarbench import QP, Case, Family, Solution, Status\n"
-        "@dataclass(frozen=True)\n"
-        "class Point(Family):\n"
-        "    forms = ('primal',)\n"
-        "    n: int = 2\n"
-        "    def build(self, form, reference):\n"
-        "        qp = QP.from_arrays([[2.0]], [-4.0], ub=self.n)\n"
-        "        return Case(qp=qp, recover=lambda s: s.x,\n"
-        "                    quantities=lambda s: {'x': float(s.x[0])})\n"
-        "PROBLEMS = {'point': Point()}\n"
-    )
-    answer = mb.solve("point/n=1/primal", "clarabel", plugins=[file])
-    assert answer.quantities["x"] == pytest.approx(1)
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -623,10 +520,3 @@ def test_a_qp_needs_no_plug_in_and_no_registry_to_be_a_case():
         "<Case qp: 2 variables, 0 equalities, 1 inequalities, 0 bounds>"
     )
     assert isinstance(case.registries, Registries)
-
-
-def test_an_option_passed_twice_is_refused():
-    with pytest.raises(mb.InputError, match="option 'max_iter' is given twice"):
-        mb.solve(
-            "obstacle/dim=1/n=4/primal", "clarabel", options={"max_iter": 9}, max_iter=3
-        )

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -13,8 +12,6 @@ import pytest
 import mortarbench as mb
 from mortarbench.harness import Verdict
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.progress import remaining, shown
-from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from tests.support import ROOT, TOY_PROBLEM
 
@@ -113,15 +110,6 @@ def test_options_are_passed_on_and_history_can_be_switched_off():
         mb.solve(case, "smalbe", options={"max_step": 3})
 
 
-def test_solvers_and_cases_of_plug_ins_and_mortarbench_can_be_combined():
-    ours = mb.build("obstacle/dim=1/n=4/primal")
-    its = mb.build("well/n=2/dual", plugins=[TOY_PROBLEM])
-
-    assert mb.solve(ours, "lost", plugins=[TOY_PROBLEM]).verdict is Verdict.FAILED
-    assert mb.solve(its, "clarabel").verdict is Verdict.VERIFIED
-    assert mb.solve(its, "exact", plugins=[TOY_PROBLEM]).verdict is Verdict.VERIFIED
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -216,20 +204,6 @@ def test_lists_are_tables():
     assert "well" in mb.problems(plugins=[TOY_PROBLEM]).names
 
 
-def test_a_solver_of_another_registry_has_its_own_description():
-    class Other:
-        """Another solver."""
-
-        def declines(self, qp):
-            return "always"
-
-        def prepare(self, qp, tol):
-            raise AssertionError
-
-    (row,) = mb.solvers(registries=Registries(solvers={"smalbe": Other()}))
-    assert row["description"] == "Another solver."
-
-
 LIGHT = [
     ["--help"],
     ["run", "--help"],
@@ -309,57 +283,6 @@ def test_a_wheel_works_without_the_checkout(tmp_path):
     assert (empty / "out/smoke/report/index.html").is_file()
 
 
-class _Display:
-    """Replacement of IPython's display that stores the last displayed object."""
-
-    def __init__(self):
-        self.shown = ""
-
-    def __call__(self, thing, *, display_id):
-        assert display_id
-        self.update(thing)
-        return self
-
-    def update(self, thing):
-        self.shown = thing._repr_html_()
-
-
-def test_in_a_notebook_a_run_shows_a_bar_and_unverified_answers(
-    monkeypatch, results, capsys
-):
-    display = _Display()
-    shell = SimpleNamespace(config={"IPKernelApp": {}})
-    ipython = SimpleNamespace(get_ipython=lambda: shell)
-    monkeypatch.setitem(sys.modules, "IPython", ipython)
-    html = type("HTML", (str,), {"_repr_html_": lambda text: text})
-    monkeypatch.setitem(
-        sys.modules, "IPython.display", SimpleNamespace(display=display, HTML=html)
-    )
-    good = results.records[0]
-    bad = good.replace(status=Verdict.WRONG, solver="<osqp>")
-
-    with shown(None) as progress:
-        progress.start(2)
-        progress.advance(good)
-        progress.advance(bad)
-
-    assert "<progress value='2' max='2'></progress> 2/2" in display.shown
-    assert capsys.readouterr().out.splitlines() == ["<osqp> on well/primal: wrong"]
-
-
-@pytest.mark.parametrize(
-    ("measured", "to_do", "seconds", "said"),
-    [
-        (0, 9, 1.0, ""),
-        (9, 0, 1.0, ""),
-        (1, 60, 60.0, "1:00:00 left"),
-        (2, 2, 7, "0:00:07 left"),
-    ],
-)
-def test_the_remaining_time_assumes_the_present_rate(measured, to_do, seconds, said):
-    assert remaining(measured, to_do, seconds) == said
-
-
 def in_many_threads(program, folder):
     """Run a user's program whose libraries may use eight threads; return its output."""
     many = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "8")
@@ -381,15 +304,3 @@ def test_a_case_built_in_many_threads_is_the_one_that_was_measured(smoke):
     )
 
     assert in_many_threads(program, smoke.folder).split() == ["2", "True"]
-
-
-@pytest.mark.slow
-def test_a_run_in_many_threads_measures_the_case_that_it_builds(tmp_path):
-    program = (
-        "import mortarbench as mb\n"
-        "found = mb.run('smoke', out='o', cases=['*/dual'], solvers=['smalbe'])\n"
-        "checked = found.validate()\n"
-        "print(checked.data['counts']['answers'], checked.agreed)\n"
-    )
-
-    assert in_many_threads(program, tmp_path).split() == ["1", "True"]

@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 from mortarbench.cli.main import main
-from mortarbench.harness import InputError, Solution, Status
+from mortarbench.harness import Solution, Status
 from mortarbench.harness.conformance.manufactured import manufactured as drawn
 from mortarbench.harness.files.store import (
     load_history,
     load_solution,
-    save,
 )
 from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.journal import read_journal
@@ -159,32 +158,6 @@ def test_a_history_is_stored_with_its_point_bit_for_bit(tmp_path, point):
             assert found[name].tobytes() == column.tobytes()
 
 
-def test_a_history_is_part_of_the_digest_but_its_absence_is_not(tmp_path, point):
-    digests = {
-        save_solution(tmp_path, point()),
-        save_solution(tmp_path, point(cost=np.ones(2))),
-        save_solution(tmp_path, point(seconds=np.ones(2))),
-        save_solution(tmp_path, point(cost=np.zeros(2))),
-    }
-    assert len(digests) == 4
-    assert "97b50261ac02503f" in digests  # as in versions without histories
-
-
-def test_points_stored_by_older_versions_have_no_history(tmp_path):
-    two = np.ones(2)
-    old = save(tmp_path, dict(x=two, y=two, z=two, z_box=two))
-
-    assert load_solution(tmp_path, old, Status.SOLVED).history == {}
-    assert load_history(tmp_path, old) == {}
-
-
-def test_a_damaged_stored_history_is_named(tmp_path, point):
-    digest = save_solution(tmp_path, point(cost=np.ones(2), active=np.ones(3)))
-
-    with pytest.raises(InputError, match=rf"{digest}.*different lengths"):
-        load_history(tmp_path, digest)
-
-
 def test_solve_turns_the_history_on_and_prints_its_columns_as_lists(cli):
     code, out, _ = cli("solve", "well/dual", "--solver", "descent", "--json")
 
@@ -204,14 +177,6 @@ def test_numbers_that_are_not_finite_are_null_in_json(cli):
     }  # fmt: skip
 
 
-def test_solvers_without_a_history_have_an_empty_one_in_json_and_no_table(cli):
-    _, out, _ = cli("solve", "well/dual", "--solver", "exact", "--json")
-    _, text, _ = cli("solve", "well/dual", "--solver", "exact")
-
-    assert strict(out)["history"] == {}
-    assert "iteration " not in text
-
-
 def test_solve_prints_counters_and_a_table_of_convergence(cli):
     _, out, _ = cli("solve", "well/dual", "--solver", "descent")
 
@@ -229,21 +194,6 @@ def test_solve_prints_counters_and_a_table_of_convergence(cli):
     assert max(map(len, legend.splitlines())) <= 80
 
 
-def test_a_row_of_the_table_ends_each_outer_iteration():
-    history = {
-        "step": np.array(list("ccpecc")), "outer": np.array([1, 1, 1, 2, 2, 3]),
-        "infeasibility": np.array([8, 4, 2, 1, 0.5, np.nan]),
-    }  # fmt: skip
-    rows = [line.split() for line in convergence(history).splitlines()]
-
-    assert rows == [
-        ["iteration", "step", "outer", "‖Ax−b‖"],
-        ["3", "c2", "p1", "1", "2.00e+00"],
-        ["5", "c1", "e1", "2", "5.00e-01"],
-        ["6", "c1", "3", "nan"],
-    ]
-
-
 def test_long_tables_keep_their_first_and_last_row_and_count_every_step():
     history = {"step": np.array(["c"] * 1000), "active": np.arange(1000)}
     rows = [line.split() for line in convergence(history).splitlines()[1:]]
@@ -252,11 +202,6 @@ def test_long_tables_keep_their_first_and_last_row_and_count_every_step():
     assert rows[0] == ["1", "c1", "0"]
     assert rows[-1][0] == "1000"
     assert sum(int(steps[1:]) for _, steps, _ in rows) == 1000
-
-
-def test_an_empty_history_has_no_table():
-    assert convergence({}) == ""
-    assert convergence({"active": np.zeros(0)}) == ""
 
 
 @pytest.mark.parametrize("kept", [True, False])

@@ -131,18 +131,3 @@ def test_a_master_without_free_nodes_leaves_standard_output_to_results(tmp_path,
     main(Registries(), ["solve", case, "--solver", "smalbe", "--json"])
 
     assert json.loads(capfd.readouterr().out)["status"] == "verified"
-
-
-def test_an_unverified_answer_has_no_remarks(sound):
-    record = sound.record.replace(status=Verdict.INACCURATE, energy_bound=np.inf)
-
-    assert remarks(sound.case, record, sound.solution) == ()
-
-
-def test_the_command_prints_notes_and_keeps_its_exit_code(tmp_path, capsys):
-    toml = BLOCKS.replace("-1e6", "-0.6e9")
-    path = stacked_blocks(tmp_path, toml=toml)
-    code = main(Registries(), ["solve", f"bodies:{path}/dual", "--solver", "smalbe"])
-
-    assert code == 0
-    assert "\nnote: body 'upper' moves by" in capsys.readouterr().out

@@ -14,7 +14,7 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 
 pytestmark = pytest.mark.together
 
-WARM = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
+WARM = ["smalbe"]
 
 
 @pytest.fixture(scope="module")

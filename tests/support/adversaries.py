@@ -28,7 +28,6 @@ from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.plugin import About, Family
 from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.worker import Worker, serve
-from mortarbench.harness.verify import measure as measuring
 
 
 @dataclass(frozen=True)
@@ -73,23 +72,6 @@ class Tiny(Family):
         return Case(
             qp=qp, recover=lambda s: s.x, quantities=quantities, fields=fields,
         )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Sized(Family):
-    """QPs  min ½|x|² + qᵀx, x ≥ 0  of any size with q > 0; the solution is x = 0."""
-
-    forms: ClassVar = ("plain",)
-
-    n: int = 10
-
-    def build(self, form, reference):
-        n = self.n
-        qp = QP(
-            P=csr_array(np.eye(n)), q=np.ones(n), A=no_rows(n), b=np.zeros(0),
-            G=no_rows(n), h=np.zeros(0), lb=np.zeros(n), ub=np.full(n, np.inf),
-        )  # fmt: skip
-        return Case(qp=qp, recover=lambda s: s.x, quantities=lambda s: {"dofs": n})
 
 
 def at_the_row(qp):
@@ -149,13 +131,6 @@ class DiesLater(Honest):
 
 class Segfaults(Honest):
     def act(self, qp):
-        ctypes.string_at(0)
-
-
-class AlwaysSegfaults(Honest):
-    """Solver that crashes even in the warm-up."""
-
-    def prepare(self, qp, tol):
         ctypes.string_at(0)
 
 
@@ -252,35 +227,6 @@ class Products(Honest):
         for _ in range(1000):
             matrix @ vector
         return at_the_row(qp)
-
-
-@dataclass(frozen=True)
-class SleepsByPower(Honest):
-    """Solver that sleeps for 0.02·(n/10)^1.5 s, ± 1 %, on the QPs of `Sized`.
-
-    The deviation is +1 % for the smallest and the largest n and −1 % between, so that
-    it does not change the slope. The clock of the worker counts only the requested
-    time, because sleeps take longer on a busy machine.
-    """
-
-    clock: ClassVar[list[float]] = [0.0]
-
-    def prepare(self, qp, tol):
-        if (qp.q != qp.q[0]).any():  # the warm-up
-            self.clock[0] = time.perf_counter()
-            measuring.perf_counter = lambda: self.clock[0]
-        return lambda: self.act(qp)
-
-    def act(self, qp):
-        if (qp.q == qp.q[0]).all():
-            noise = 1.01 if qp.q.size in (10, 80) else 0.99
-            seconds = 0.02 * (qp.q.size / 10) ** 1.5 * noise
-            time.sleep(seconds)
-            self.clock[0] += seconds
-        return Solution(
-            status=Status.SOLVED, x=np.zeros(qp.q.size), y=0 * qp.b, z=0 * qp.h,
-            z_box=-qp.q,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -419,16 +365,6 @@ class Breaks(Honest):
         from numpy import no_such_function  # noqa: F401
 
 
-class NumpyScalars(Honest):
-    """Solver that returns integers of numpy, which json does not serialise."""
-
-    def act(self, qp):
-        return replace(
-            at_the_row(qp), status="solved", iterations=np.int64(5),
-            counts={"products": np.int64(7)},
-        )  # fmt: skip
-
-
 def unsolved(qp):
     """Raise ArithmeticError: without a reference solution, residuals decide."""
     raise ArithmeticError("no reference solve")
@@ -439,7 +375,7 @@ SOLVERS = {
     for name, kind in list(globals().items())
     if isinstance(kind, type) and issubclass(kind, Honest)
 }
-PROBLEMS = {"tiny": Tiny(), "sized": Sized()}
+PROBLEMS = {"tiny": Tiny()}
 
 if __name__ == "__main__":
     what, *pipes = sys.argv[1:]

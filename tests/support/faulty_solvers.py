@@ -55,10 +55,6 @@ class HoldsAbsentBounds(Sound):
         return replace(s, z_box=s.z_box - self.by)
 
 
-class LeavesRoundOff(HoldsAbsentBounds):
-    by = 3.5e-18
-
-
 class Remembers(Sound):
     def act(self, qp, tol):
         s = self.honest(qp, tol)

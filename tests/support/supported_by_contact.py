@@ -7,14 +7,11 @@ in rational arithmetic. Only the guess of the closed rows uses the code under te
 
 from __future__ import annotations
 
-from fractions import Fraction
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness import Case, Mechanics
-from mortarbench.harness.mechanics import Extended, Real
+from mortarbench.harness import Case
+from mortarbench.harness.mechanics import Extended
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -174,58 +171,11 @@ def _rotation(angle: float) -> NDArray[np.float64]:
     ])  # fmt: skip
 
 
-def stored_solution(
-    mechanics: Mechanics, closed: NDArray[np.bool_], near: Extended
-) -> tuple[Extended, Extended]:
-    """Solve for u and λ of the stored data.
-
-    Rigid motions that the closed rows do not prevent are taken from `near`. The
-    function asserts that no closed row is tensile and that no open row is violated.
-    """
-    primal = mechanics.primal
-    K, B = primal.P.toarray(), primal.G.toarray()
-    free = np.setdiff1d(np.arange(len(K)), mechanics.exact.fixed)
-    rows = B[closed][:, free]
-    loose = _loose(rows, mechanics.inverse.kernel[free])
-    rows = np.vstack([rows, loose.T])
-    whole = np.block(
-        [[K[np.ix_(free, free)], rows.T], [rows, np.zeros(2 * rows.shape[:1])]]
-    )
-    at = loose.T @ near[free].astype(np.float64)
-    x = _solve(whole, np.concatenate([-primal.q[free], primal.h[closed], at]))
-    u, lam = np.zeros(len(K), dtype=Real), np.zeros(len(B), dtype=Real)
-    u[free], lam[closed] = x[: free.size], x[free.size :][: closed.sum()]
-    gap = mechanics.exact.c - mechanics.exact.B @ u
-    assert lam.min() >= -1e-12 * lam.max()
-    assert gap.min() >= -1e-12 * max(np.abs(gap).max(), np.abs(u).max())
-    return u, lam
-
-
 def _loose(rows: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rigid motions (range of R) that lie in the kernel of the rows."""
     _, sizes, turn = np.linalg.svd(rows @ R)
     count = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
     return np.asarray(R @ turn[count:].T)
-
-
-def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> Extended:
-    n, scale, scaled = len(b), np.ones(len(b)), A.copy()
-    for _ in range(20):
-        by = 2.0 ** np.round(0.5 * np.log2(np.abs(scaled).max(axis=1)))
-        scale, scaled = scale / by, scaled / by[:, None] / by
-    factor, order = _eliminated(scaled.astype(Real))
-    entries = [[(j, Fraction(A[i, j])) for j in np.flatnonzero(A[i])] for i in range(n)]
-    x = [Fraction(0)] * n
-    for _ in range(6):
-        left = [
-            Fraction(v) - sum(a * x[j] for j, a in e)
-            for v, e in zip(b, entries, strict=True)
-        ]
-        r = np.array([Real(float(v)) for v in left]) * scale
-        step = _substituted(factor, r[order]) * scale
-        x = [_short(v + Fraction(float(s))) for v, s in zip(x, step, strict=True)]
-    assert np.abs(step).max() < 1e-20 * np.abs(_extended(x)).max()
-    return _extended(x)
 
 
 def _eliminated(A: Extended) -> tuple[Extended, NDArray[np.int64]]:
@@ -246,15 +196,3 @@ def _substituted(factor: Extended, b: Extended) -> Extended:
         x[k] /= factor[k, k]
         x[:k] -= factor[:k, k] * x[k]
     return x
-
-
-def _short(v: Fraction) -> Fraction:
-    """Round a fraction to 200 bits."""
-    shift = 200 - v.numerator.bit_length() + v.denominator.bit_length()
-    return Fraction(round(v * Fraction(2) ** shift)) / Fraction(2) ** shift if v else v
-
-
-def _extended(x: list[Fraction]) -> Extended:
-    first: Any = np.array([float(v) for v in x])
-    rest = [float(v - Fraction(a)) for v, a in zip(x, first, strict=True)]
-    return np.asarray(first.astype(Real) + np.array(rest))

@@ -42,7 +42,6 @@ from mortarbench.harness import (
     Reference,
     Solution,
     Vector,
-    no_rows,
 )
 from mortarbench.harness.keys import Range
 from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
@@ -237,12 +236,7 @@ def _normal_qp(cells: Cells, gap: Vector) -> QP:
     return QP(
         P=influence_operator(cells.places, cells.h),
         q=gap,
-        A=no_rows(n),
-        b=np.zeros(0),
-        G=no_rows(n),
-        h=np.zeros(0),
         lb=np.zeros(n),
-        ub=np.full(n, np.inf),
     )
 
 
@@ -359,10 +353,6 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
     qp = QP(
         P=P,
         q=np.tile([-loading.delta, 0.0], k),
-        A=no_rows(2 * k),
-        b=np.zeros(0),
-        G=no_rows(2 * k),
-        h=np.zeros(0),
         sets=(Discs(np.arange(2 * k).reshape(k, 2), bound),),
     )
 

@@ -12,12 +12,10 @@ from mortarbench.cli.main import main
 from mortarbench.harness import QP, Case, Mechanics, Solution, Status, no_rows
 from mortarbench.harness.crossval.comparison import (
     StoredAnswer,
-    brief,
     compare_answers,
-    energy_allowed,
 )
 from mortarbench.harness.crossval.references import reference_point
-from mortarbench.harness.files.qpfile import qp_digest, save_qp
+from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.names import parse
 from mortarbench.harness.record import Verdict
@@ -26,8 +24,7 @@ from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.verify.verdicts import judged, new_record
 from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from mortarbench.reports.document import markdown
-from mortarbench.reports.validation import compose, write_validation
+from mortarbench.reports.validation import write_validation
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import FALSE_CLAIMS
 from tests.support.stored import save_solution
@@ -84,14 +81,6 @@ def cli(capsys):
         return code, *capsys.readouterr()
 
     return cli
-
-
-def write_text_alone(directory, data):
-    """Write only the Markdown page, without figures."""
-    path = directory / "report" / "validation.md"
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(markdown(compose(data)))
-    return [path]
 
 
 def verdict_on(cli, folder, *more):
@@ -289,16 +278,6 @@ def test_a_certificate_contradicted_by_the_reference_is_a_harness_error(
         assert [a["solver"] for a in listed(verdict, "contradicted")] == ["a"] * code
 
 
-def test_different_multipliers_of_one_contact_force_agree(duplicate):
-    shares = {"first": (1.5, 0.0), "second": (0.0, 1.5), "both": (0.5, 1.0)}
-    answers = [stored_answer(duplicate, k, pushed(z)) for k, z in shares.items()]
-
-    found = compare_answers(answers, reference_solution)
-
-    assert all(a.force_error < 1e-15 for a in found)
-    assert {a.outcome for a in found} == {"agrees"}
-
-
 def finds_nothing(qp):
     raise ArithmeticError("it found nothing")
 
@@ -313,81 +292,6 @@ def test_without_a_reference_answers_are_judged_by_their_residuals(duplicate):
 
     assert [a.outcome for a in found] == ["not validated", "refuted"]
     assert "it found nothing" in found[0].text
-
-
-@pytest.mark.parametrize("serialised", [True, False])
-def test_a_qp_has_the_digest_that_a_run_stores(serialised, truths, tmp_path):
-    for case, _ in truths.values():
-        written = save_qp(tmp_path / "qp.npz", case.qp, {}, serialised=serialised)
-        assert qp_digest(case.qp, serialised=serialised) == written
-
-
-def test_the_allowed_error_follows_from_a_gap_of_ten_tolerances():
-    assert energy_allowed(1e-8) == pytest.approx(np.sqrt(20e-8))
-    assert energy_allowed(0.5) == pytest.approx(np.sqrt(0.2))
-
-
-def test_the_table_compares_primal_with_dual(truths, tmp_path, cli):
-    off = disturbed(*truths[2, "dual-bounds"], 1e-3)
-    asked = {"smalbe": "dual", "b": "primal", "c": "dual"}
-    exact = [(k, f"{BEAM}/{form}", truths[2, form][1]) for k, form in asked.items()]
-    write(
-        tmp_path, [*exact, *((k, f"{BEAM}/dual-bounds", off) for k in "bc")], tol=1e-4
-    )
-    write(tmp_path, exact, tol=1e-6)
-
-    _, verdict = verdict_on(cli, tmp_path)
-
-    rows = {(r["solver"], r["tol"]): r for r in verdict["solvers"]}
-    assert rows["b", 1e-4]["primal_dual"] == pytest.approx(1e-3, rel=1e-3)
-    assert rows["c", 1e-4]["primal_dual"] is None  # only dual forms
-    assert rows["b", 1e-6]["primal_dual"] is None  # one form at this tolerance
-
-
-@pytest.mark.slow  # slow solve; the tests of HiGHS and of a constructed point are quick
-def test_proxqp_without_its_gap_check_is_refuted(tmp_path, cli):
-    text = "obstacle/n=16/primal"
-    case = built(text)
-    s = PLUGIN.solvers["proxqp-unchecked"].prepare(case.qp, 1e-6)()
-    exact = reference_solution(case.qp)
-    answers = [(label, text, exact) for label in HONEST]
-
-    code, verdict = verdict_on(
-        cli, write(tmp_path, [*answers, ("proxqp-unchecked", text, s)], tol=1e-6)
-    )
-
-    assert s.status is Status.SOLVED
-    assert (code, culprits(verdict)) == (1, {"proxqp-unchecked"})
-    assert listed(verdict)[0]["error"] > 0.05
-    assert "error of displacement" in listed(verdict)[0]["text"]
-
-
-def test_highs_on_a_problem_with_bounds_only_is_refuted(tmp_path, cli):
-    qp = built("membrane/qp").qp
-    s = PLUGIN.solvers["highs-bare"].prepare(qp, 1e-6)()
-    answers = [
-        ("a", "membrane/qp", reference_solution(qp)),
-        ("highs", "membrane/qp", s),
-    ]
-
-    code, verdict = verdict_on(
-        cli, write(tmp_path, answers, tol=1e-6), "--plugin", FALSE_CLAIMS
-    )
-
-    assert s.status is Status.SOLVED
-    assert (code, culprits(verdict)) == (1, {"highs"})
-    assert listed(verdict)[0]["error"] > 0.1
-
-
-def test_the_candidate_that_three_usual_residuals_accept_is_refuted(tmp_path, cli):
-    qp = built("half/qp").qp
-    s = PLUGIN.solvers["at-the-row"].prepare(qp, 1e-8)()
-    answers = [("a", "half/qp", reference_solution(qp)), ("at-the-row", "half/qp", s)]
-
-    code, verdict = verdict_on(cli, write(tmp_path, answers), "--plugin", FALSE_CLAIMS)
-
-    assert (code, culprits(verdict)) == (1, {"at-the-row"})
-    assert listed(verdict)[0]["text"].startswith("KKT residual")
 
 
 def test_claims_without_a_point_are_refuted_and_crashes_are_listed(
@@ -409,19 +313,6 @@ def test_claims_without_a_point_are_refuted_and_crashes_are_listed(
     (dies,) = listed(verdict, "unanswered")
     assert (dies["solver"], dies["text"]) == ("dies", "crashed: as it ended")
     assert not any(a["solver"] == "picky" for a in verdict["answers"])
-
-
-def test_an_unrefuted_claim_is_listed(tmp_path, cli):
-    qp = built("membrane/qp").qp
-    denied = PLUGIN.solvers["denies"].prepare(qp, 1e-8)()
-    answers = [("a", "half/qp", pulled()), ("denies", "membrane/qp", denied)]
-
-    code, verdict = verdict_on(cli, write(tmp_path, answers), "--plugin", FALSE_CLAIMS)
-
-    assert code == 0
-    (denied,) = listed(verdict, "unanswered")
-    told = "infeasible claim: no certificate of infeasibility was found"
-    assert denied["text"] == told
 
 
 def test_a_form_that_all_solvers_call_infeasible_is_refuted_by_other_forms(
@@ -530,20 +421,6 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, cli):
         assert "Traceback" not in err
 
 
-def test_a_file_at_the_path_of_the_page_is_reported_with_the_remedy(
-    truths, tmp_path, cli
-):
-    folder = write(tmp_path, [("a", f"{BEAM}/primal", truths[2, "primal"][1])])
-    (folder / "report").touch()
-    code, _, err = cli(folder, validation_page=write_validation)
-
-    assert code == 2
-    assert err.splitlines()[-1] == (
-        f"mortarbench: {folder / 'report'}: a file exists where a folder is needed; "
-        "move the file away"
-    )
-
-
 def test_hostile_names_and_huge_numbers_do_not_break_page_or_terminal(
     truths, tmp_path, cli
 ):
@@ -579,19 +456,3 @@ def test_a_failing_recovery_affects_only_that_answer(duplicate):
 
     assert [a.outcome for a in found] == ["agrees", "not validated"]
     assert "no way back" in found[1].text
-
-
-def test_the_norm_of_errors_is_stated(truths, tmp_path, cli):
-    folder = write(tmp_path, [("a", f"{BEAM}/primal", truths[2, "primal"][1])])
-
-    _, out, _ = cli(folder, validation_page=write_text_alone)
-
-    page = (folder / "report" / "validation.md").read_text()
-    assert "Certified relative errors of the solvers in the energy norm" in " ".join(
-        out.split()
-    )
-    assert "exceeds √(20t)‖u" in page
-
-
-def test_small_numbers_have_two_digits_each():
-    assert [brief(x) for x in (1.0, 4e-4, 3.17e-9)] == ["1.0e0", "4.0e-4", "3.2e-9"]

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import lapack
 from scipy.sparse import csc_array, csr_array, eye_array, kron, random_array
 
 from mortarbench.harness.distributed import factor as factor_module
 from mortarbench.harness.distributed.factor import DependentRowsError, bordered_factor
 from mortarbench.harness.distributed.sparse import (
-    BorderedFactor,
+    Block,
     Composition,
     CompressedRows,
     DirectSum,
@@ -28,21 +29,15 @@ def test_products_are_those_of_the_dense_matrix(shape):
     assert rows.shape == shape
     assert rows @ x == pytest.approx(dense @ x)
     assert rows.transposed_times(v) == pytest.approx(dense.T @ v)
-    assert rows.combined(2.0, v, -3.0, x) == pytest.approx(2 * v - 3 * (dense @ x))
 
 
 def test_other_formats_and_vectors_are_refused():
     M = csr_array(np.eye(3))
-    rows, short, fit = CompressedRows(M), np.zeros(2), np.zeros(3)
+    rows, short = CompressedRows(M), np.zeros(2)
 
     with pytest.raises(ValueError, match="csc matrix; expected one by rows"):
         CompressedRows(M.tocsc())
-    for product in (
-        lambda: rows @ short,
-        lambda: rows.transposed_times(short),
-        lambda: rows.combined(1.0, short, 1.0, fit),
-        lambda: rows.combined(1.0, fit, 1.0, short),
-    ):
+    for product in (lambda: rows @ short, lambda: rows.transposed_times(short)):
         with pytest.raises(ValueError, match="2 components; expected 3"):
             product()
 
@@ -53,26 +48,6 @@ def M():
     dense = random_array((7, 5), density=0.6, rng=np.random.default_rng(SEED)).toarray()
     dense[[2, 6]], dense[:, 3] = 0, 0
     return dense
-
-
-def test_rows_are_transposed_selected_and_normalised(M):
-    rows = CompressedRows(csr_array(M))
-
-    def dense(part):
-        return np.column_stack([part @ unit for unit in np.eye(part.shape[1])])
-
-    assert dense(rows) == pytest.approx(M)
-    assert dense(CompressedRows.of_array(M)) == pytest.approx(M)
-    assert dense(rows.transposed()) == pytest.approx(M.T)
-    assert dense(CompressedRows.of_transpose(csc_array(M))) == pytest.approx(M.T)
-    assert dense(rows.rows(np.array([4, 0, 4]))) == pytest.approx(M[[4, 0, 4]])
-    assert rows.by_columns.toarray() == pytest.approx(M.T)
-    assert rows.touched.tolist() == (np.abs(M).sum(axis=0) > 0).tolist()
-    unit, sizes = rows.unit_columns()
-    assert sizes == pytest.approx(np.linalg.norm(M, axis=0))
-    assert dense(unit) * sizes == pytest.approx(M)
-    with pytest.raises(ValueError, match="csr matrix; expected one by columns"):
-        CompressedRows.of_transpose(csr_array(M))
 
 
 def test_outer_products_of_selected_rows_are_summed(M):
@@ -114,12 +89,10 @@ def grid(cells):
     return csc_array(kron(path, one) + kron(one, path) + eye_array(cells**2))
 
 
-@pytest.fixture(params=["array", "library"])
+@pytest.fixture(params=["dense", "sparse"])
 def way(request, monkeypatch):
-    """Factorise small matrices by compiled code, or by the library used for
-    large ones.
-    """
-    if request.param == "library":
+    """Use a dense factor, or the sparse one that is used for large matrices."""
+    if request.param == "sparse":
         monkeypatch.setattr(factor_module, "MAX_ARRAY_ROWS", -1)
 
 
@@ -178,11 +151,47 @@ def test_dependent_rows_have_no_factor(last):
         bordered_factor(csc_array(gram), np.array(last, dtype=np.int64))
 
 
-def test_a_row_with_many_entries_is_eliminated_late():
-    """Early elimination of the hub of a star would couple all other rows."""
-    A = csc_array(5 * eye_array(40)).tolil()
-    A[0, 1:], A[1:, 0] = 0.1, 0.1
-    L = BorderedFactor.of_array(A.toarray(), np.array([20]))
+@pytest.mark.parametrize(
+    ("rows", "n"), [(1, 1), (3, 7), (9, 2), (0, 4), (5, 0), (257, 60)]
+)
+@pytest.mark.parametrize("members", [1, 3, 24])
+@pytest.mark.parametrize("columns", [0, 1, 5])
+def test_blocks_multiply_the_columns_of_all_members(rows, n, members, columns):
+    rng = np.random.default_rng(n + columns)
+    M, X = rng.standard_normal((rows, n)), rng.standard_normal((n, members * columns))
+    both = DirectSum(Block(2 * np.ones((1, 1)), 1, 3), Block(M, n, members))
+    before = np.arange(3.0 * columns).reshape(3, columns)
+    x = np.vstack([before, X.reshape(n * members, columns)])
 
-    assert L.entries <= 3 * 40
-    assert L(np.ones(40)) == pytest.approx(np.linalg.solve(A.toarray(), np.ones(40)))
+    y = both(x)
+
+    assert y[:3].tolist() == (2 * before).tolist()
+    product = y[3:].reshape(rows, members * columns)
+    assert product == pytest.approx(M @ X, abs=1e-12)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 5])
+def test_triangles_and_objects_multiply_like_arrays(columns):
+    rng = np.random.default_rng(columns)
+    M = rng.standard_normal((4, 4))
+    M += M.T
+
+    class Halved:
+        def __matmul__(self, X):
+            return X / 2
+
+    x = rng.standard_normal((10, columns))
+    blocks = DirectSum(Block(lapack.dtrttp(M)[0], 4, 1), Block(Halved(), 3, 2))
+
+    assert blocks(x) == pytest.approx(np.vstack([M @ x[:4], x[4:] / 2]), abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("shape", "n", "members"), [((3, 3), 4, 2), ((3, 2), 3, 2), ((6,), 3, 2)]
+)
+def test_blocks_that_do_not_fit_are_refused(shape, n, members):
+    """A triangle needs a class with one member."""
+    with pytest.raises(ValueError, match=rf"cannot multiply a \({n}, {members}\)"):
+        Block(np.zeros(shape), n, members)
+    with pytest.raises(ValueError, match="9 components; expected 6"):
+        Block(np.zeros((3, 3)), 3, 2)(np.zeros(9))

@@ -7,18 +7,15 @@ import platform
 import re
 import socket
 import subprocess
-import sys
 import tomllib
 from hashlib import sha256
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mortarbench.harness.environment.doctor import advice, render
 from mortarbench.harness.environment.environment import (
     capture,
-    capture_in,
     cholmod_blas,
     digest,
     source,
@@ -26,7 +23,6 @@ from mortarbench.harness.environment.environment import (
 from tests.support import ROOT
 
 DEBIAN = "/usr/lib/x86_64-linux-gnu"
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def pool(library="libopenblas", owner="system", threads=1):
@@ -161,21 +157,6 @@ def test_two_states_of_a_dirty_checkout_have_different_digests(checkout, name):
     assert re.fullmatch("[0-9a-f]{12}", states[0]["changes"])
 
 
-def test_a_capture_contains_the_versions_that_the_modules_report():
-    versions = capture()["versions"]
-    assert versions["numpy"] == np.__version__
-    assert versions["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert None not in versions.values()
-
-
-def test_thread_variables_take_effect_in_the_captured_process():
-    captured = capture_in(ONE_THREAD)
-    pools = captured["threads"]["pools"]
-    assert captured["threads"]["variables"].items() >= ONE_THREAD.items()
-    assert {"numpy", "scipy"} <= {p["owner"] for p in pools}
-    assert {p["threads"] for p in pools} == {1}
-
-
 @pytest.mark.parametrize(
     ("pools", "blas"),
     [
@@ -228,18 +209,6 @@ def test_values_that_cannot_be_read_are_not_criticised(quiet):
 
     assert advice(quiet) == {}
     assert "machine.turbo" in str(render(quiet, "0123456789ab"))
-
-
-def test_values_are_aligned_with_the_advice_below(quiet):
-    environment = changed(quiet, "machine.governor", "powersave")
-    lines = str(render(environment, "0123456789ab")).splitlines()
-    at = next(i for i, line in enumerate(lines) if "powersave" in line)
-
-    assert lines[at + 1].index("→") == lines[at].index("powersave")
-    assert "cpupower" in lines[at + 1]
-    assert lines[-1] == (
-        "1 thing to change (→) before measuring. Environment 0123456789ab."
-    )
 
 
 def read_pins():

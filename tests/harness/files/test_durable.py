@@ -21,12 +21,10 @@ from mortarbench.harness.files.durable import (
     refuse_full_disk,
     remove_unfinished,
     replace_file,
-    replacing,
     report_full_disk,
 )
 from mortarbench.harness.processes import measurement as remote
 from mortarbench.harness.registry import load_plugin
-from mortarbench.harness.results.folder import lock_folder, refuse_foreign
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 
@@ -77,16 +75,6 @@ def test_a_file_that_cannot_be_synced_replaces_nothing(tmp_path, monkeypatch):
     assert path.read_bytes() == b"old"
 
 
-def test_a_block_that_raises_replaces_nothing(tmp_path):
-    path = tmp_path / "file"
-    replace_file(path, b"old")
-    with pytest.raises(TypeError), replacing(path) as file:
-        file.writelines([b"new", "not bytes"])
-
-    assert path.read_bytes() == b"old"
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
-
-
 def test_the_message_on_a_full_disk_names_the_disk_and_the_remedy(tmp_path):
     said = "free some space; the same command continues the run"
     for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
@@ -126,18 +114,6 @@ def test_only_unfinished_files_of_writers_are_removed(tmp_path):
 
     files = (p for p in tmp_path.rglob("*") if p.is_file())
     assert sorted(str(p.relative_to(tmp_path)) for p in files) == sorted(others)
-
-
-def test_a_run_killed_at_its_start_leaves_a_recognised_folder(tmp_path):
-    busy = pytest.raises(InputError, match="is being written by another run")
-    with lock_folder(tmp_path), busy, lock_folder(tmp_path):
-        pass
-    (tmp_path / "suite.toml").write_text("")  # environment.json is missing
-    refuse_foreign(tmp_path)
-
-    (tmp_path / ".lock").write_text("somebody else's")
-    with pytest.raises(InputError, match="is not a result folder"):
-        refuse_foreign(tmp_path)
 
 
 SUITE = """

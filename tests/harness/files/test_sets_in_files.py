@@ -1,7 +1,5 @@
 """Discs and cones in files: round trips, and refusal of incomplete sets."""
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -62,13 +60,6 @@ def test_a_qp_over_sets_is_the_same_after_writing(tmp_path, suffix, name):
     assert back.sizes == qp.sizes
 
 
-def test_sizes_count_the_blocks_of_every_kind():
-    qp = qp_over(*SETS["two kinds of discs"])
-    assert qp.sizes["discs"] == 2
-    assert repr(qp).endswith("0 bounds, 2 discs, 1 cones>")
-    assert "discs" not in qp_over().sizes
-
-
 def test_digests_distinguish_sets():
     """A different radius, index, class or order within a block defines a different
     problem; the order of the sets does not.
@@ -92,25 +83,6 @@ def test_arrays_saved_by_numpy_alone_are_read(tmp_path):
     arrays = {name: getattr(qp, name) for name in ("P", "q", "G", "h")}
     np.savez(path, **arrays, disc_index=[[1, 4], [6, 2]], disc_radius=[2, 0.5])
     assert arrays_of(mb.build(f"file:{path}").qp) == arrays_of(qp)
-
-
-def test_octave_may_store_rows_columns_and_doubles(tmp_path):
-    qp = qp_over(*SETS["discs"])
-    path = mb.export(qp, tmp_path / "qp.mat")
-    arrays = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
-    assert arrays["disc_radius"].shape == (2, 1)
-    arrays["disc_index"] = arrays["disc_index"].astype(float)
-    arrays["disc_radius"] = arrays["disc_radius"].T
-    savemat(path, arrays)
-    assert arrays_of(mb.build(f"file:{path}").qp) == arrays_of(qp)
-
-
-def test_other_readers_of_parquet_find_the_sets_as_columns(tmp_path):
-    path = mb.export(qp_over(*SETS["two kinds of discs"]), tmp_path / "qp.parquet")
-    row = pd.read_parquet(path).iloc[0]
-    assert row["disc_index"].tolist() == [5, 1, 2]
-    assert row["disc2_radius"].tolist() == [0.5]
-    assert row["cone_slope"].tolist() == [1e300]
 
 
 @pytest.mark.parametrize(
@@ -159,22 +131,3 @@ def test_qps_files_cannot_store_sets(tmp_path):
     with pytest.raises(mb.InputError, match="QPS cannot store Discs; expect"):
         mb.export(qp_over(*SETS["discs"]), tmp_path / "qp.qps")
     assert not [*tmp_path.iterdir()]
-
-
-def test_a_suite_runs_a_file_with_discs_and_replays_it(tmp_path):
-    qp = qp_over(*SETS["discs"])
-    path = mb.export(replace(qp, q=10 * qp.q), tmp_path / "qp.npz")
-    suite = {
-        "name": "sets", "tolerances": [1e-6], "repeats": 1,
-        "solvers": ["clarabel", "osqp"],
-        "problems": [{"family": "file", "params": {"path": str(path)}}],
-    }  # fmt: skip
-    results = mb.run(suite, out=tmp_path / "out")
-    frame = results.df.set_index("solver")
-
-    assert frame.loc["clarabel", "status"] == "verified"
-    assert frame.loc["osqp", "status"] == "declined"
-    assert "Discs" in frame.loc["osqp", "message"]
-    again = mb.replay(tmp_path / "out", frame.loc["clarabel", "run_id"])
-    assert again.reproduced
-    assert again.same_qp

@@ -1,14 +1,10 @@
-import os
-import shutil
 import subprocess
 import sys
-import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mortarbench.harness import ContactSide, Fields, InputError, Solution, Status
+from mortarbench.harness import Fields, InputError, Solution, Status
 from mortarbench.harness.files.store import (
     load_fields,
     load_solution,
@@ -76,18 +72,6 @@ gc.collect()
     assert done.stderr == ""
 
 
-def test_equal_points_are_one_file_whenever_they_are_stored(tmp_path, solution):
-    first = save_solution(tmp_path / "a", solution)
-    os.utime(tmp_path / "a" / "vectors" / f"{first}.npz", (0, 0))
-    time.sleep(0.01)
-    save_solution(tmp_path / "a", moved(solution))
-    second = save_solution(tmp_path / "b", moved(solution))
-
-    assert first == second
-    (file,) = (tmp_path / "a" / "vectors").iterdir()
-    assert file.stat().st_mtime == 0  # not written again
-
-
 def test_every_vector_its_name_and_its_shape_are_part_of_the_digest(tmp_path, solution):
     variants = [
         solution,
@@ -111,12 +95,6 @@ def test_a_deformed_state_comes_back_with_its_nodal_fields(tmp_path, fields):
     np.testing.assert_array_equal(loaded.displacement, fields.displacement)
 
 
-def test_the_name_of_a_nodal_field_is_part_of_the_digest(tmp_path, fields):
-    renamed = replace(fields, nodal={"pressure": fields.nodal["von_mises"]})
-
-    assert save_fields(tmp_path, renamed) != save_fields(tmp_path, fields)
-
-
 def test_contact_forces_are_restored_if_present(tmp_path, fields):
     with_contact = Fields(
         points=fields.points, cells=fields.cells, bodies=fields.bodies,
@@ -129,12 +107,6 @@ def test_contact_forces_are_restored_if_present(tmp_path, fields):
     np.testing.assert_array_equal(loaded.contact_forces, [[0.0, -5.0]])
 
 
-def test_no_temporary_file_is_left(tmp_path, solution):
-    save_solution(tmp_path, solution)
-
-    assert [f.suffix for f in (tmp_path / "vectors").iterdir()] == [".npz"]
-
-
 def test_a_missing_or_damaged_file_is_named(tmp_path, solution):
     digest = save_solution(tmp_path, solution)
     file = tmp_path / "vectors" / f"{digest}.npz"
@@ -144,35 +116,3 @@ def test_a_missing_or_damaged_file_is_named(tmp_path, solution):
         load_solution(tmp_path, digest, Status.SOLVED)
     with pytest.raises(InputError, match="0000"):
         load_solution(tmp_path, "0000", Status.SOLVED)
-
-
-def test_a_point_is_stored_if_its_folder_was_deleted(tmp_path, solution):
-    save_solution(tmp_path, solution)
-    shutil.rmtree(tmp_path / "vectors")
-    digest = save_solution(tmp_path, solution)
-
-    assert load_solution(tmp_path, digest, Status.SOLVED).z_box[0] == np.inf
-
-
-def test_each_contact_of_a_deformed_state_comes_back(tmp_path, fields):
-    sides = tuple(
-        ContactSide(
-            name=f"ä on {i}", nodes=np.array([i, 3]), length=np.array([0.5, 0.25]),
-            force=np.arange(4.0).reshape(2, 2) - i, pressure=np.array([i, 2.0]),
-            gap=np.array([0.0, np.nan]),
-        )
-        for i in range(2)
-    )  # fmt: skip
-    rough = {"shear": np.array([1.0, -2.0]), "friction": np.array(["slip", "open"])}
-    sides = (sides[0], replace(sides[1], **rough))
-    stored = replace(fields, contacts=sides)
-    loaded = load_fields(tmp_path, save_fields(tmp_path, stored))
-
-    assert [side.name for side in loaded.contacts] == ["ä on 0", "ä on 1"]
-    for one, two in zip(loaded.contacts, sides, strict=True):
-        for part in ("nodes", "length", "force", "pressure", "gap"):
-            np.testing.assert_array_equal(getattr(one, part), getattr(two, part))
-    assert loaded.contacts[0].friction is loaded.contacts[0].shear is None
-    for part, values in rough.items():
-        np.testing.assert_array_equal(getattr(loaded.contacts[1], part), values)
-    assert load_fields(tmp_path, save_fields(tmp_path, fields)).contacts == ()

@@ -44,7 +44,6 @@ TINY = ACCIDENTS.problems["tiny"]
 CASE = assemble("tiny", TINY, {}, "plain")
 
 FOREIGN = "was received, expected 'solved'"
-SUSPECT = "the solver reuses answers of earlier solves"
 PARENTS_TIME = "the parent's time is recorded"
 #: expected verdict and pattern of the message, by solver
 OUTCOMES = {
@@ -272,18 +271,6 @@ def test_work_in_declines_is_timed(bench):
 
     assert record.prepare_seconds >= 0.02
     assert record.message == ""
-
-
-def test_remembered_answers_are_marked_and_a_slow_first_call_is_not(bench):
-    for _ in range(2):
-        record = bench("remembers")
-        assert record.remembered is True
-        assert SUSPECT in record.message
-
-        record = bench("compiles")
-        assert record.remembered is False
-        assert record.message == ""
-        assert record.total_seconds < 0.2  # compiling takes 0.3 s
 
 
 @pytest.mark.parametrize("solver", ["diesonothers", "hangsonothers"])

@@ -10,11 +10,8 @@ from mortarbench.cli.main import main
 from mortarbench.harness.distributed import mpi
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.store import load_solution
-from mortarbench.harness.names import parse
 from mortarbench.harness.solution import Status
-from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from tests.support import press
 from tests.support.hexahedra import TETRAHEDRA
 from tests.support.solid_blocks import TOML, solid_blocks
 
@@ -84,23 +81,6 @@ def test_ranks_read_a_mesh_in_parts(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("parts", [6, 20])
-def test_ranks_solve_a_disc_that_rolls(tmp_path, parts):
-    """Node-to-segment rows do not resist rolling, so the equality rows are
-    dependent.
-    """
-    description = press.described(tmp_path)
-    text = description.read_text().replace('"mortar"', '"nts"')
-    held = '[[supports]]\npoint = "axis"\nfix = ["x"]\n'
-    assert held in text
-    description.write_text(text.replace(held, ""))
-    case = mb.build(f"bodies:{description}/parts={parts}/dual")
-    ranks, alone = (mb.solve(case, "smalbe", tol=TOL, ranks=n) for n in (2, 1))
-    assert ranks.verdict == alone.verdict == "verified"
-    assert ranks.record.objective == pytest.approx(alone.record.objective, rel=1e-8)
-
-
-@pytest.mark.slow
 def test_thirty_solves_on_four_ranks_do_not_diverge():
     """All solves on the same number of ranks have the same bits."""
     case = mb.build("beam-ring/Nr=4/Nh=3/steps=1/feti=2/dual")
@@ -165,27 +145,6 @@ def test_cases_that_ranks_cannot_divide_are_declined_before_any_rank_starts(
     answer = mb.solve(name, "smalbe", ranks=3)
     assert answer.verdict == "declined"
     assert answer.record.message.startswith(message)
-
-
-@pytest.mark.parametrize(
-    ("name", "subdomains"),
-    [
-        ("membranes/S=2/n=4/dual", 8),
-        ("contact-patch/lower=4/upper=4/feti=2/dual", 4),
-        ("obstacle/n=8/feti=4/dual", 4),
-        ("beam-ring/steps=1/dual", 1),
-        ("beam-ring/steps=1/feti=4/primal", 1),
-        ("beam-ring/kinematics=finite/steps=1/dual", 1),
-        ("plate/primal", 1),
-        ("hertz-plane/dual", 1),
-        ("obstacle/dim=1/feti=5/dual", 1),
-    ],
-)
-def test_a_case_has_as_many_ranks_as_subdomains(name, subdomains):
-    case = parse(name, PROBLEMS)
-    family = case.family
-    assert family.subdomains(case.form) == subdomains
-    assert (family.on_ranks(case.form) is None) == (subdomains == 1)
 
 
 @pytest.mark.parametrize("count", ["0", "-1", "5000"])

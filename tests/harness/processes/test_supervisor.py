@@ -3,7 +3,6 @@ import os
 import signal
 import sys
 from pathlib import Path
-from select import select
 
 import pytest
 
@@ -176,15 +175,6 @@ def test_a_worker_that_cannot_start_states_the_reason(ask):
     assert reply.message == "before solving: exit code 1: no such plug-in"
 
 
-def test_a_worker_that_is_never_ready_does_not_count_as_a_time_limit(ask, monkeypatch):
-    monkeypatch.setattr(supervisor, "START_SECONDS", 0.2)
-    start = [sys.executable, "-c", "import time; time.sleep(3600)"]
-    reply = ask("slow", start=start)
-
-    assert reply.verdict is Verdict.FAILED
-    assert reply.message == "before solving: killed after 0.2 s"
-
-
 def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
     tiny = load_plugin(PLUGIN).problems["tiny"]
     save_qp(tmp_path / "qp.npz", tiny.build("plain", None).qp, {})
@@ -224,31 +214,3 @@ def test_lack_of_memory_is_recognised_by_the_peak_and_by_the_message(
     message, peak, expected
 ):
     assert out_of_memory(message, peak, 100.0) is expected
-
-
-def test_replies_that_arrive_together_are_read_without_waiting(tmp_path, monkeypatch):
-    both = SHOWS.replace('    reply(event="start")\n', "").replace(
-        "    reply(\n        event=\"done\",",
-        '    both = ""\n'
-        '    for event in ("start", "done"):\n'
-        '        both += json.dumps({"event": event}) + "\\n"\n'
-        "    os.write(replies, both.encode())\n"
-        '    dict(',
-    )  # fmt: skip
-    worker = WorkerProcess([sys.executable, "-c", both], tmp_path / "log")
-    limits = dict(time_limit=60, memory_limit=2000)
-    waited = []
-
-    def watched(*args):
-        found = select(*args)
-        waited.append(found[0] == [])
-        return found
-
-    try:
-        assert worker.ask({}, **limits).answer == {}
-        monkeypatch.setattr(supervisor, "POLL_SECONDS", 5.0)
-        monkeypatch.setattr(supervisor, "select", watched)
-        assert worker.ask({}, **limits).answer == {}
-    finally:
-        worker.close()
-    assert waited == [False]

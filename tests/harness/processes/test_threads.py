@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from functools import partial
 from threading import Event, Thread
 
@@ -110,12 +109,6 @@ def test_concurrent_builds_solves_and_runs_in_threads_are_correct(tmp_path, time
     assert_all_right(found, 3 * times)
 
 
-@pytest.mark.slow
-def test_four_hundred_solves_in_eight_threads_are_correct_and_leave_no_files(tmp_path):
-    found = of_threads(tmp_path, 8, 50, "solve")
-    assert_all_right(found, 400)
-
-
 @pytest.fixture
 def worker(tmp_path):
     worker = WorkerProcess(COMMAND, tmp_path / "log")
@@ -136,26 +129,6 @@ def test_threads_that_share_or_close_a_worker_receive_one_answer_each(worker):
     for thread in threads:
         thread.join()
     assert [answer is not None for answer in answers] == [True] * 4
-
-
-def test_closing_twice_does_not_close_another_file(worker, tmp_path):
-    worker.ask({}, **LIMITS)
-    worker.close()
-    others = [(tmp_path / f"{i}").open("w") for i in range(8)]
-    worker.close()
-    for file in others:
-        file.write("still open")
-        file.close()
-
-
-def test_a_worker_reaped_by_other_code_is_replaced(worker):
-    first = worker.ask({}, **LIMITS).answer["pid"]
-    os.kill(first, signal.SIGKILL)
-    with suppress(ChildProcessError):
-        os.waitpid(worker._process.pid, 0)  # as a handler of SIGCHLD would do
-
-    second = worker.ask({}, **LIMITS)
-    assert second.answer["pid"] != first
 
 
 def test_a_fork_of_a_process_leaves_its_workers_alone(worker):
@@ -286,42 +259,3 @@ def test_an_ignored_signal_stays_ignored(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True)
     assert (done.returncode, done.stdout) == (143, b"goes on\n")
-
-
-def test_a_terminated_export_says_so_and_leaves_no_file(tmp_path):
-    """The signal arrives while the case is built."""
-    plugin, out, started = (tmp_path / n for n in ("slow.py", "out", "started"))
-    plugin.write_text(SLOW)
-    out.mkdir()
-    export = subprocess.Popen(
-        [sys.executable, "-m", "mortarbench", "export", "slow/primal",
-         str(out / "qp.mat"), "--plugin", str(plugin)],
-        env=env(tmp_path) | {"STARTED": str(started)},
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert soon(lambda: started.exists() or export.poll() is not None)
-    export.send_signal(signal.SIGTERM)
-    printed, said = export.communicate()
-
-    assert (printed, said) == ("", "mortarbench: terminated\n")
-    assert export.returncode == 143
-    assert not list(out.iterdir())
-    assert not list(tmp_path.glob("mortarbench-*"))
-
-
-SLOW = """
-import os, time
-from dataclasses import dataclass
-from pathlib import Path
-from mortarbench import Family
-
-@dataclass(frozen=True)
-class Slow(Family):
-    forms = ("primal",)
-
-    def build(self, form, reference):
-        Path(os.environ["STARTED"]).touch()
-        time.sleep(3600)
-
-PROBLEMS = {"slow": Slow()}
-"""

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mortarbench.cli.main import main
-from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
@@ -174,16 +174,6 @@ def test_differences_of_the_environment_are_named(cli, stored, tmp_path):
     assert "threads.variables" not in out
 
 
-def test_the_first_digits_of_a_run_id_suffice(cli, stored):
-    ids = [r.run_id for r in stored.values()]
-    then = stored["exact", 1, 0].run_id
-    short = next(
-        then[:n] for n in range(1, 13) if sum(i.startswith(then[:n]) for i in ids) == 1
-    )
-
-    assert then in cli("replay", "done", short)[1]
-
-
 def test_an_unknown_run_id_is_reported_with_the_most_similar_one(cli, stored):
     then = stored["exact", 1, 0].run_id
     other = "x" + then[1:]
@@ -192,45 +182,6 @@ def test_an_unknown_run_id_is_reported_with_the_most_similar_one(cli, stored):
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert f"'{other}'" in err
     assert f"the nearest is {then}" in err
-
-
-@pytest.mark.parametrize("run_id", ["", "g"])
-def test_ambiguous_or_unknown_digits_are_refused(cli, stored, run_id):
-    code, _, err = cli("replay", "done", run_id)
-
-    assert (code, err.count("\n")) == (2, 1)
-
-
-def test_a_folder_without_a_journal_is_reported_in_one_line(cli):
-    code, _, err = cli("replay", "nowhere", "0123")
-
-    assert (code, err.count("\n")) == (2, 1)
-    assert "nowhere" in err
-
-
-@pytest.mark.parametrize("missing", ["suite.toml", "environment.json"])
-def test_a_missing_file_of_a_stored_run_is_reported_in_one_line(
-    cli, stored, tmp_path, missing
-):
-    (tmp_path / "done" / missing).unlink()
-    code, _, err = cli("replay", "done", stored["exact", 1, 0].run_id)
-
-    assert (code, err.count("\n")) == (2, 1)
-    assert "done" in err
-
-
-@pytest.mark.parametrize("lost", [{"solvers": {}}, {"families": {}}])
-def test_a_missing_plug_in_is_requested(cli, registries, tmp_path, lost):
-    (tmp_path / "toy.toml").write_text(SUITE)
-    (tmp_path / "empty.py").write_text("SOLVERS = {}\n")
-    little = ("--solver", "exact", "--repeats", "1")
-    cli("run", "toy.toml", "--out", "done", "--plugin", "empty.py", *little)
-    run_id = read_journal(tmp_path / "done")[0].run_id
-    code, _, err = cli("replay", "done", run_id, registries=replace(registries, **lost))
-
-    assert (code, err.count("\n")) == (2, 1)
-    assert "unknown" in err
-    assert "--plugin empty.py" in err
 
 
 def test_a_case_with_a_changed_file_is_refused(cli, manufactured, tmp_path):
@@ -252,19 +203,3 @@ def test_a_case_with_a_changed_file_is_refused(cli, manufactured, tmp_path):
     assert (code, err.count("\n")) == (2, 1)
     assert record.run_id in err
     assert "the file changed" in err
-
-
-@pytest.mark.parametrize("shape", ["box", "everything"])
-def test_equal_qps_have_equal_digests_and_different_qps_do_not(
-    manufactured, tmp_path, shape
-):
-    qp, _ = manufactured(shape)
-    file = tmp_path / "a.npz"
-    digest = save_qp(file, qp, {"name": "whatever"})
-    loaded, _ = load_qp(file)
-
-    # overwrites the file from which the QP is mapped
-    assert save_qp(file, loaded, {}) == digest
-    assert (loaded.q == qp.q).all()
-    for change in ({"q": 2 * qp.q}, {"P": 2 * qp.P}, {"ub": qp.ub + 1}):
-        assert save_qp(file, replace(qp, **change), {}) != digest

@@ -253,14 +253,6 @@ def test_a_cluster_without_workers_ends_the_run_which_the_same_command_continues
     assert len(before) == SOLVERS < len(measured("d"))
 
 
-def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
-    cluster.join(nthreads=2)
-    code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", cluster.address)
-
-    assert code == 2
-    assert "--nthreads 1" in err.splitlines()[-1]
-
-
 def test_an_address_without_a_scheduler_is_reported_in_one_line(cli, monkeypatch):
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "ucx://x", ""):
@@ -268,41 +260,6 @@ def test_an_address_without_a_scheduler_is_reported_in_one_line(cli, monkeypatch
         assert code == 2
         assert err.splitlines()[-1].startswith(f"mortarbench: --dask {address}:")
         assert not Path("d").exists()
-
-
-def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeypatch):
-    """Test the option --fresh, which deletes earlier results before a run."""
-    monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
-    assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
-    before = measured("d")
-
-    code = cli("run", "toy.toml", "--out", "d", "--fresh", "--dask", "nonsense://x")[0]
-
-    assert code == 2
-    assert measured("d") == before
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_a_run_on_a_local_cluster_without_a_traceback(tmp_path):
-    """A terminal sends SIGINT to the whole group of processes."""
-    (tmp_path / "toy.toml").write_text(suite_of(CASES))
-    starts = tmp_path / "starts"
-    starts.touch()
-    run = start(
-        "--out", "d", "--dask", "local", cwd=tmp_path, start_new_session=True,
-        stderr=subprocess.PIPE, text=True, env=os.environ | {"STARTS": str(starts)},
-    )  # fmt: skip
-    assert soon(starts.read_text)
-    cluster = descendants(run.pid)
-    os.killpg(run.pid, signal.SIGINT)
-    said = run.communicate()[1]
-
-    assert run.returncode == 130, said
-    assert "Traceback" not in said
-    assert cluster
-    assert soon(
-        lambda: not any(Path(f"/proc/{process}").exists() for process in cluster)
-    )
 
 
 def test_a_missing_dask_is_reported_with_the_package_to_install(cli, monkeypatch):
@@ -396,40 +353,6 @@ def test_after_a_killed_parent_the_next_run_cleans_up_and_continues(
     assert soon(lambda: not descendants(worker.pid))
 
 
-@pytest.fixture
-def one_cpu():
-    """Restrict processes started by the test to one CPU."""
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(before)})
-    yield
-    os.sched_setaffinity(0, before)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("one_cpu")
-def test_a_worker_with_one_cpu_serves_a_run_beside_an_orphaned_worker(
-    cli, cluster, tmp_path
-):
-    """A scheduler may detect a dead client only after the start of the next run.
-
-    A stopped parent imitates this delay.
-    """
-    worker = cluster.join(serves=False)
-    run = start("--out", "d", "--dask", cluster.address)
-    assert soon(lambda: stored("d"))
-    run.send_signal(signal.SIGSTOP)
-    try:
-        code, _, err = cli("run", "toy.toml", "--out", "e", "--dask", cluster.address)
-        assert code == 0, err
-        assert len(measured("e")) == CASES * SOLVERS
-    finally:
-        run.kill()
-        run.wait()
-    few = ("run", "toy.toml", "--out", "f", "--case", "well/depth=2/dual")
-    assert cli(*few, "--dask", cluster.address)[0] == 0
-    assert soon(lambda: not descendants(worker.pid))
-
-
 UNGUARDED = """
 import sys
 import mortarbench as mb
@@ -499,28 +422,6 @@ def meet():
         return kept, said
 
     return meet
-
-
-def test_an_equal_node_is_stored_without_a_warning(meet):
-    kept, said = meet(lambda there: there["now"].update(load=3.0))
-    assert (len(kept), said) == (1, [])
-
-
-def test_another_environment_is_stored_with_one_warning(meet):
-    for _ in range(2):
-        kept, said = meet(lambda there: there["machine"].update(cpu="Another"))
-    assert len(kept) == 1
-    assert len(said) == 1
-    cpu = capture()["machine"]["cpu"]
-    assert said[0].startswith(
-        "node07 measures under different conditions from this machine "
-        f"(machine.cpu: {cpu} here, Another there); "
-    )
-
-
-def test_workers_that_share_a_machine_are_named_in_the_warning(meet):
-    _, said = meet(lambda there: there["machine"].update(shared_by_workers=2))
-    assert "(machine.shared_by_workers: None here, 2 there)" in said[0]
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.suite.solver_options import (
     listed_options,
     parse_options,
@@ -138,14 +138,6 @@ def test_labels_contain_the_value_in_canonical_form():
     assert labels("alpha=1e-3") == labels("alpha=0.001")
 
 
-def test_an_option_overrides_the_option_in_the_suite():
-    own = SolverSpec(name="method", label="mine", options={"max_iter": 9, "alpha": 2.0})
-    (changed,) = sweep([own], {"max_iter": ["5"]}, SOLVERS)
-
-    assert changed.label == "mine max_iter=5"
-    assert resolve(changed, SOLVERS) == Method(max_iter=5, alpha=2.0)
-
-
 def test_a_null_arm_has_the_options_of_its_twin():
     null = SolverSpec(name="method", label="method (A/A)", role="null")
     found = sweep([*SPECS[:1], null], {"max_iter": ["5"]}, SOLVERS)
@@ -187,29 +179,3 @@ def test_options_of_a_program_are_those_of_the_command_line():
     )
     (null,) = sweep(SPECS[:1], listed_options({"seed": None}), SOLVERS)
     assert null.options == {"seed": None}
-
-
-@dataclass(frozen=True)
-class Sized:
-    rho: float = 1  # an int, as users may write
-    start: Any = 0  # not annotated: the type of the default
-
-    declines, prepare = Method.declines, Method.prepare
-
-
-@pytest.mark.parametrize("solver", [Sized(), Sized(rho=10)])
-@pytest.mark.parametrize(("text", "value"), [("0.1", 0.1), ("2", 2.0), ("1e-3", 1e-3)])
-def test_an_integer_default_does_not_narrow_a_float(solver, text, value):
-    registry = {"sized": solver}
-    specs = [SolverSpec(name="sized", label="sized")]
-    one = typed_options("sized", f"rho={text}", registry)
-    (spec,) = sweep(specs, {"rho": [text]}, registry)
-
-    assert one == {"rho": value}
-    assert resolve(spec, registry).rho == value
-
-
-def test_the_default_determines_the_type_if_the_annotation_does_not():
-    assert typed_options("sized", "start=3", {"sized": Sized()}) == {"start": 3}
-    with pytest.raises(InputError, match=r"start = '0\.5'; expected an integer"):
-        typed_options("sized", "start=0.5", {"sized": Sized()})

@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar
 import pytest
 
 from mortarbench import problems, solvers
-from mortarbench.cli.paper import BEYOND
 from mortarbench.harness import InputError, Range
 from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
@@ -329,19 +328,6 @@ def shipped(name):
     return load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
 
 
-def test_crossval_has_every_family_in_every_form_and_many_solvers():
-    crossval = shipped("crossval")
-
-    assert crossval.tolerances == (1e-8,)
-    assert len(crossval.cases) >= 40
-    assert len(crossval.solvers) >= 10
-    assert {(c.family_name, c.form) for c in crossval.cases} == {
-        (name, form)
-        for name, family in problems.PROBLEMS.items()
-        for form in family.forms
-    }
-
-
 def paths_of(suite):
     return [c.params["path"] for c in suite.cases if "path" in c.params]
 
@@ -423,30 +409,6 @@ def test_a_sequence_may_run_along_zipped_keys():
     assert [
         [(c.params["step"], c.params["newton"]) for c in s] for s in paths.sequences
     ] == [[(step, newton) for step in range(1, 11) for newton in range(1, 5)]] * 2
-
-
-@pytest.mark.parametrize("name", BEYOND)
-def test_suites_beyond_the_paper_can_be_narrowed(name):
-    """With fewer than six repeats, the median has no 95 % interval."""
-    suite = shipped(name)
-    narrowed = with_overrides(
-        suite, problems.PROBLEMS, solvers.SOLVERS, **BEYOND[name]
-    )  # fmt: skip
-
-    assert (suite.name, suite.repeats) == (name, 6)
-    assert 0 < len(narrowed.cases) < len(suite.cases)
-    assert {"smalbe", "osqp", "piqp"} == {s.label for s in narrowed.solvers}
-
-
-def test_the_suite_of_the_paper_has_a_null_arm():
-    paper = shipped("paper")
-
-    assert len(paper.cases) == 30
-    assert [(s.label, s.role) for s in paper.solvers if s.name == "smalbe"] == [
-        ("smalbe", ""), ("smalbe (A/A)", "null"),
-    ]  # fmt: skip
-    kept = with_overrides(paper, problems.PROBLEMS, solvers.SOLVERS, solvers=["smalbe"])
-    assert [s.label for s in kept.solvers] == ["smalbe", "smalbe (A/A)"]
 
 
 def test_a_pattern_keeps_all_steps_of_a_sequence_or_none():
@@ -535,16 +497,3 @@ def test_a_wrong_grid_of_options_is_refused(load, options, message):
     text = f"solvers = [{{ name = 'osqp', options = {{ {options} }} }}]\n"
     with pytest.raises(InputError, match=re.escape(message)):
         load(f'name = "demo"\n{text}{BLOCK}')
-
-
-def test_the_suite_of_the_crossover_reaches_a_million_dofs_in_2d_and_3d():
-    suite = load_suite(
-        ROOT / "suites/crossover.toml", problems.PROBLEMS, solvers.SOLVERS
-    )
-    largest = {case.family_name: case.params for case in suite.cases}
-
-    p = largest["beam-ring"]
-    nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1) + (12 * p["Nh"] + 1) * (p["radial"] + 1)
-    assert 0.9e6 < 2 * nodes < 1.1e6
-    assert 0.9e6 < 3 * (largest["cube-wall"]["n"] + 1) ** 3 < 1.1e6
-    assert set(names(suite)) == {name for line in suite.lines for name in line}

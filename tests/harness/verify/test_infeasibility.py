@@ -1,8 +1,6 @@
 """Claims of infeasible and unbounded QPs, compared with exact solutions."""
 
 from dataclasses import replace
-from itertools import count
-from time import monotonic
 
 import numpy as np
 import pytest
@@ -10,14 +8,12 @@ from scipy.sparse import csr_array, eye_array
 
 from mortarbench.harness import QP, Cones, Discs, Solution, Status, Verdict, no_rows
 from mortarbench.harness.conformance.manufactured import (
-    SHAPES,
     infeasible,
     manufactured,
     unbounded,
 )
 from mortarbench.harness.record import Record
 from mortarbench.harness.verify.infeasibility import (
-    MIN_MARGIN,
     NO_POINT,
     certificate_of,
     farkas_margin,
@@ -171,15 +167,6 @@ def test_rows_that_only_rounding_contradicts_are_not_called_infeasible():
     assert not proven(qp)
 
 
-def test_bounds_alone_contradict_nothing():
-    assert not proven(qp_of(n=2, lb=0, ub=0))
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_qps_with_planted_solutions_are_not_proven_infeasible(shape):
-    assert not proven(manufactured(shape)[0])
-
-
 @pytest.mark.parametrize(
     "z", [(1, -1), (np.nan, 1), (np.inf, 1), (0, 0), (1, 2), (1e-30, 1e-30), (1, 1)]
 )
@@ -211,23 +198,6 @@ def test_a_combination_that_cancels_only_up_to_rounding_is_proven(n):
 
 
 @pytest.mark.parametrize("number", SEARCHED)
-def test_rows_that_rounding_makes_parallel_are_feasible_far_away(number):
-    """Two rows contradict by 1e-11 to 1e-8, but their normals differ in the last bit.
-
-    Multipliers for which the normals cancel in double precision prove nothing.
-    """
-    rng, count = np.random.default_rng(0), 0
-    for _ in range(number):
-        a, t, h = rng.standard_normal(2), rng.uniform(0.2, 3), rng.uniform(0.5, 2)
-        gap = 10 ** rng.uniform(-11, -8)
-        qp = qp_of(G=[a, -t * a], h=[h, -t * h * (1 + gap)])
-        if any(proven(qp, z=z) for z in ((t, 1.0), (1.0, 1 / t))):
-            count += 1
-            assert not is_feasible(within_radius(qp, TOL))
-    assert count > number / 20
-
-
-@pytest.mark.parametrize("number", SEARCHED)
 @pytest.mark.parametrize("tol", [1e-8, 1e-4])
 def test_no_proof_of_a_search_is_false(number, tol):
     """Nearly contradicting rows have no point within the radius if they are proven."""
@@ -238,19 +208,6 @@ def test_no_proof_of_a_search_is_false(number, tol):
             proofs += 1
             assert not is_feasible(within_radius(qp, tol)), seed
     assert proofs > number / 40
-
-
-@pytest.mark.slow
-def test_no_proof_of_a_long_search_is_false():
-    end, proofs = monotonic() + 90, 0
-    for seed in iter(count(10**6).__next__, None):
-        if monotonic() > end:
-            break
-        qp = nearly_contradicting(np.random.default_rng(seed))
-        if proven(qp):
-            proofs += 1
-            assert not is_feasible(within_radius(qp, TOL)), seed
-    assert proofs > 20
 
 
 @pytest.mark.parametrize("number", SEARCHED)
@@ -428,9 +385,3 @@ def test_a_correct_claim_counts_despite_a_small_violation_of_its_point():
     assert judged(record(), qp, point).status is Verdict.VERIFIED
     claim = replace(point, status=Status.INFEASIBLE)
     assert judged(record(), qp, claim).status is Verdict.VERIFIED_INFEASIBLE
-
-
-def test_margins_below_rounding_prove_nothing():
-    assert MIN_MARGIN == 1e-12
-    for gap, expected in ((1e-13, False), (1e-9, True)):
-        assert proven(qp_of(G=[[1], [-1]], h=[1, -1 - gap])) is expected

@@ -126,7 +126,7 @@ def test_the_dual_has_the_displacement_of_the_plate(name):
 @pytest.mark.parametrize("keys", [{}, {**CUBES, "n": 2}])
 def test_every_load_pulls_with_one_meganewton(load, keys):
     plate = Plate(load=load, **keys)
-    f = -plate.primal().q.reshape(-1, plate.dim)
+    f = -plate.qp.q.reshape(-1, plate.dim)
     assert f[:, -1].sum() == pytest.approx(-1.0)
     assert not f[:, :-1].any()
 

@@ -160,7 +160,6 @@ def test_the_digest_is_that_of_the_case_without_ranks(name):
     [
         "beam-ring/steps=1/dual", "beam-ring/steps=1/feti=4/primal",
         "beam-ring/kinematics=finite/steps=1/dual", "plate/primal", "hertz-plane/dual",
-        "obstacle/dim=1/feti=5/dual",
     ],
 )  # fmt: skip
 def test_cases_without_subdomains_are_not_built_on_ranks(name):

@@ -5,23 +5,23 @@ import pytest
 
 from mortarbench.problems.duality.decomposed import longitudinal_share
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
-from mortarbench.problems.fem.mesh import half_ring_grid, join, rectangle_grid
+from mortarbench.problems.fem.mesh import half_ring, join, rectangle
 from mortarbench.problems.feti.structured import lines, shape_factors, spacings
 from tests.support.glued import decompose, structured_bodies
 
 pytestmark = pytest.mark.together
 
 GRIDS = (
-    rectangle_grid((0.0, 0.5), (2.0, 0.25), (13, 5)),
-    half_ring_grid((1.0, 0.0), (0.3, 0.49), (11, 7)),
-    rectangle_grid((0.0, 0.0), (1.0, 1.0), (2, 2)),
+    rectangle((0.0, 0.5), (2.0, 0.25), (13, 5)),
+    half_ring((1.0, 0.0), (0.3, 0.49), (11, 7)),
+    rectangle((0.0, 0.0), (1.0, 1.0), (2, 2)),
 )
 
 
 @pytest.fixture(scope="module", params=[1, 3, 4, 20])
 def torn(request):
     """Return the size of blocks of three grids, and the torn meshes of the grids."""
-    mesh, body = join(tuple(grid.mesh() for grid in GRIDS))
+    mesh, body = join(GRIDS)
     label = structured_bodies([grid.divisions for grid in GRIDS], request.param)
     whole = decompose(mesh.points, mesh.cells, label, body)
     return request.param, whole
@@ -37,9 +37,7 @@ def stiffest_saw_tooth(D, r):
     the stiffness is the fixed point of S = A − B(A + S)⁻¹B, which adds one layer at a
     time.
     """
-    K = stiffness(
-        rectangle_grid((0, 0), (1, r), (1, 1)).mesh(), D[None], np.zeros(1, int)
-    )
+    K = stiffness(rectangle((0, 0), (1, r), (1, 1)), D[None], np.zeros(1, int))
     sign = np.kron([[1, 0], [-1, 0], [0, 1], [0, -1]], np.eye(2))
     layer = sign.T @ K.toarray() @ sign
     top, across, base = layer[:2, :2], layer[:2, 2:], layer[2:, 2:]
@@ -72,7 +70,7 @@ def test_the_factor_is_averaged_at_crosspoints_and_one_without_interfaces():
 
 
 def test_spacings_are_those_of_the_cells_around():
-    assert spacings(GRIDS[0].points) == pytest.approx(np.tile([2 / 13, 0.05], (84, 1)))
+    assert spacings(GRIDS[0].grid) == pytest.approx(np.tile([2 / 13, 0.05], (84, 1)))
 
 
 def test_sides_of_grids_count_as_lines_on_request(torn):
@@ -82,9 +80,9 @@ def test_sides_of_grids_count_as_lines_on_request(torn):
         for ends in (False, True)
     )
     on_side = np.zeros((whole.nodes, 2), dtype=bool)
-    start = np.cumsum([0] + [grid.nodes for grid in GRIDS])
+    start = np.cumsum([0] + [len(grid.points) for grid in GRIDS])
     for first, grid in zip(start, GRIDS, strict=False):
-        bottom, right, top, left = grid.sides.values()
+        bottom, right, top, left = grid.boundaries.values()
         on_side[first + np.append(bottom, top), 0] = True
         on_side[first + np.append(left, right), 1] = True
 

@@ -4,43 +4,40 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mortarbench.problems.duality.problem import HalfDiscs, StructuredGrids
-from mortarbench.problems.fem.mesh import HalfDisc, half_ring_grid, join, rectangle_grid
+from mortarbench.problems.duality.problem import Structured
+from mortarbench.problems.fem.mesh import half_disc, half_ring, join, rectangle
 from mortarbench.problems.feti.subdomains import subdomain_ranks
-from mortarbench.problems.feti.tearing import compact_blocks, label_blocks
+from mortarbench.problems.feti.tearing import compact_blocks, joined_labels
 from tests.support.decomposed_bodies import parts_of
 from tests.support.glued import decompose, structured_bodies
 
 pytestmark = pytest.mark.together
 
 GRIDS = (
-    rectangle_grid((0.0, 0.5), (2.0, 0.25), (13, 5)),
-    half_ring_grid((1.0, 0.0), (0.3, 0.49), (11, 7)),
-    rectangle_grid((0.0, 0.0), (1.0, 1.0), (2, 2)),
+    rectangle((0.0, 0.5), (2.0, 0.25), (13, 5)),
+    half_ring((1.0, 0.0), (0.3, 0.49), (11, 7)),
+    rectangle((0.0, 0.0), (1.0, 1.0), (2, 2)),
 )
 DISCS = (
-    HalfDisc((0.0, 8.0), np.linspace(-np.pi, 0, 15), 8 * 0.8 ** np.arange(9)),
-    HalfDisc((0.0, -2.0), np.pi * np.linspace(0, 1, 8) ** 2, np.array([2.0, 1.5])),
-    HalfDisc((0.0, 0.0), np.linspace(0, np.pi, 5), np.array([1.0])),
+    half_disc((0.0, 8.0), np.linspace(-np.pi, 0, 15), 8 * 0.8 ** np.arange(9)),
+    half_disc((0.0, -2.0), np.pi * np.linspace(0, 1, 8) ** 2, np.array([2.0, 1.5])),
+    half_disc((0.0, 0.0), np.linspace(0, np.pi, 5), np.array([1.0])),
 )
 
 
-def torn(bodies, label):
-    mesh, body = join(tuple(one.mesh() for one in bodies))
+def torn(parts, label):
+    mesh, body = join(parts)
     return mesh, body, decompose(mesh.points, mesh.cells, label, body)
 
 
 def grids(most):
     label = structured_bodies([grid.divisions for grid in GRIDS], most)
-    return StructuredGrids(GRIDS).layout(most), *torn(GRIDS, label)
+    return Structured(GRIDS).layout(most), *torn(GRIDS, label)
 
 
 def discs(most):
-    blocks = [compact_blocks(disc.lengths(), most) for disc in DISCS]
-    labels = [np.zeros(0, dtype=np.int64)]
-    for own in blocks:
-        labels.append(label_blocks(own) + labels[-1].max(initial=-1) + 1)
-    return HalfDiscs(DISCS).layout(most), *torn(DISCS, np.concatenate(labels))
+    label = joined_labels([compact_blocks(disc.grid, most) for disc in DISCS])
+    return Structured(DISCS).layout(most), *torn(DISCS, label)
 
 
 @pytest.fixture(

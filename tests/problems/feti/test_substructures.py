@@ -91,3 +91,13 @@ def test_a_squared_product_is_with_the_squares_of_all_entries(
     found = parts.squared_product(v)
     assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
     assert_allclose(dense(parts), K, atol=0)  # K is unchanged
+
+
+def test_products_keep_digits_beyond_those_of_a_double(parts: LocalProblems) -> None:
+    """The product is linear in a part of v that a double cannot represent beside v."""
+    rng = np.random.default_rng(12)
+    v, part = rng.standard_normal((2, parts.spread.shape[0])).astype(np.longdouble)
+    part *= np.longdouble(2) ** -50
+    change = parts.product(v + part) - parts.product(v)
+    expected = parts.product(part)
+    assert np.abs(change - expected).max() <= 0.01 * np.abs(expected).max()

@@ -17,7 +17,8 @@ from mortarbench.reports.measurements import read_measurements
 from mortarbench.reports.paper import bodies, physics, timings
 from mortarbench.reports.paper.report import compose, write_paper
 from mortarbench.solvers.reference.solve import reference_solution
-from mortarbench.solvers.smalbe.solver import PAPER, SMALBE
+from mortarbench.solvers.smalbe.solver import SMALBE
+from mortarbench.solvers.smalbe.textbook import PAPER
 
 #: one process runs the module, so that measurements are made only once
 pytestmark = pytest.mark.together

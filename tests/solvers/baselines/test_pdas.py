@@ -11,11 +11,11 @@ from mortarbench.harness import QP, Status, no_rows
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
-from mortarbench.solvers.baselines.infeasibility_certificate import (
+from mortarbench.solvers.baselines.pdas import PDAS
+from mortarbench.solvers.common.infeasibility_certificate import (
     proves_infeasible,
     proves_unbounded,
 )
-from mortarbench.solvers.baselines.pdas import PDAS
 from mortarbench.solvers.reference.solve import reference_solution
 
 

@@ -12,8 +12,6 @@ from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
-from mortarbench.solvers.smalbe import driver
-from tests.support.textbook import loop
 
 pytestmark = pytest.mark.together
 
@@ -54,30 +52,6 @@ def test_friction_takes_fewer_products_than_published_rules(name):
     assert products([found["smalbe"]]) <= 0.85 * min(
         products([found[s]]) for s in PRESETS
     )
-
-
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize(
-    ("solver", "recycle", "steps"),
-    [("smalbe", False, 25), ("smalbe", True, 18), ("smalbe-permon", False, 25)],
-)
-def test_compiled_steps_and_textbook_steps_are_the_same(
-    name, solver, recycle, steps, monkeypatch
-):
-    """The first steps agree. Rounding errors change later steps, and they do so earlier
-    if directions are stored.
-    """
-    qp, runs = emitted(name), []
-    for compiled in (True, False):
-        options = replace(
-            SOLVERS[solver], recycle=recycle, max_steps=steps, history=True
-        )
-        if not compiled:
-            monkeypatch.setattr(driver, "outer_loop", loop.outer_loop)
-        runs.append(options.prepare(qp, TOL)())
-
-    assert list(runs[0].history["step"]) == list(runs[1].history["step"])
-    assert runs[0].x == pytest.approx(runs[1].x, abs=1e-6 * abs(runs[1].x).max())
 
 
 def test_all_slipping_rows_slip_back():
@@ -153,10 +127,9 @@ def fixed_point(qp, mu, solve, enough):
     raise AssertionError(f"residual {residual} after 60 problems")
 
 
-@pytest.mark.parametrize("name", ["smalbe", "smalbe-permon"])
-def test_a_warm_fixed_point_takes_about_half_the_products_of_a_cold_one(name):
-    """Each solver follows its own sequence to the same residual of Coulomb's law."""
-    qp, solver, enough = emitted("greco/n=16/dual-bounds"), SOLVERS[name], 1e-7
+def test_a_warm_fixed_point_takes_about_half_the_products_of_a_cold_one():
+    """Both sequences end at the same residual of Coulomb's law."""
+    qp, solver, enough = emitted("greco/n=16/dual-bounds"), SOLVERS["smalbe"], 1e-7
     prepare = solver.chain(TOL)
     warm, left = fixed_point(qp, 1.0, lambda qp: prepare(qp)(), enough)
     cold, _ = fixed_point(qp, 1.0, lambda qp: solver.prepare(qp, TOL)(), enough)

@@ -1,6 +1,7 @@
 """Preconditioners on faces: exact cases, restriction to the face, counters."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,9 +13,8 @@ from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.driver import outer_loop
+from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
 from mortarbench.solvers.smalbe.solver import SMALBE
-from tests.support.textbook.loop import face_preconditioner
-from tests.support.textbook.projected import by_lanczos, projected_problem
 
 BETWEEN = dict(expansion="std", proportioning="cg", eliminate="never")
 
@@ -41,24 +41,14 @@ def gap():
     )  # fmt: skip
 
 
-def textbook(problem, qp, kind, free):
-    return face_preconditioner(problem, qp, kind)(1.0)(free)
-
-
-def ours(problem, qp, kind, free):
-    loop = outer_loop(problem, qp, SMALBE(preconditioner=kind))
-    return lambda v: loop.solver.precondition(free, v, 1.0)
-
-
-@pytest.fixture(params=[ours, textbook])
-def in_face(request):
+@pytest.fixture
+def in_face():
     """Return the preconditioner on a face and the norm of the projected problem."""
 
     def prepared(qp, kind, free):
-        problem = projected_problem(
-            qp, lambda PFP, rows: by_lanczos(PFP, rows, steps=8)
-        )
-        return request.param(problem, qp, kind, free), problem.spectrum.norm
+        problem = projected_problem(qp, partial(by_lanczos, steps=8))
+        solver = outer_loop(problem, qp, SMALBE(preconditioner=kind)).solver
+        return lambda v: solver.precondition(free, v, 1.0), problem.spectrum.norm
 
     return prepared
 

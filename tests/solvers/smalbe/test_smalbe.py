@@ -15,11 +15,13 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.common.stopping import relative_residual
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe import driver
+from mortarbench.solvers.smalbe.projected import (
+    by_lanczos,
+    projected_problem,
+    times_projected,
+)
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
-from mortarbench.solvers.smalbe.spectrum import power_method
-from tests.support.textbook import loop
-from tests.support.textbook.projected import by_lanczos, lanczos, projected_problem
 
 INHOUSE = [name for name in SOLVERS if name.startswith("smalbe")]
 
@@ -28,15 +30,31 @@ def projected(qp, steps=10):
     return projected_problem(qp, partial(by_lanczos, steps=steps))
 
 
-@pytest.fixture(params=[driver.outer_loop, loop.outer_loop], ids=["ours", "textbook"])
-def outer_loop(request):
+def hessian(problem, rho):
+    """Return H (n, n)."""
+    C, N = problem.rows.C, problem.spectrum.norm
+    columns = np.eye(problem.b.size)
+    PFP = [times_projected(problem.F, problem.rows, v) / N for v in columns]
+    return np.column_stack(PFP) + rho * C.T @ C
+
+
+def lanczos(H, start, steps):
+    """Return the Ritz pairs of a symmetric matrix H (n, n)."""
+    n = len(H)
+    qp = bounded(H, np.zeros(n))
+    problem = projected_problem(qp, partial(by_lanczos, steps=steps, start=start))
+    return problem.spectrum.ritz
+
+
+@pytest.fixture
+def outer_loop():
     def run(problem, *, M=1.0, eta=0.1, rho=3.0, growth=1.0, tol=1e-8):
         options = SMALBE(
             expansion="mixed", proportioning="cg", preconditioner="none", M=M,
             beta=0.5, eta=eta, rho_growth=growth, max_steps=20_000, energy=0.0,
             recycle=False,
         )  # fmt: skip
-        chosen = request.param(problem, None, options)
+        chosen = driver.outer_loop(problem, None, options)
         x, mu = np.zeros(problem.b.size), np.zeros(len(problem.rows.C))
         return chosen.solve(tol, chosen.first(x, mu, M=M, rho=rho))
 
@@ -192,15 +210,6 @@ def test_a_stalled_multiplier_increases_the_penalty():
     assert s.counts["outer"] < 100
 
 
-@pytest.mark.parametrize("rho", [0.1, 3.0, 100.0])
-def test_the_gradient_projection_step_is_shorter_than_two_over_the_norm(dual, rho):
-    problem = projected(dual(271828), 30)
-    H = np.column_stack([problem.H(v, rho) for v in np.eye(30)])
-    alpha = 1 / problem.plain_model(rho, alpha=1.9).tau
-
-    assert 1.8 <= alpha * np.linalg.norm(H, 2) < 2
-
-
 def test_the_model_uses_the_lanczos_process_and_the_rows(dual):
     """The model is ρ on C, and the Ritz value plus its residual on a Ritz vector.
     Elsewhere the model is far below the norm, because the spectrum decays like 1/k².
@@ -211,16 +220,21 @@ def test_the_model_uses_the_lanczos_process_and_the_rows(dual):
     G, x = rng.standard_normal((3, 60)), rng.random(60)
     qp = bounded((F + F.T) / 2, rng.standard_normal(60), G, G @ x, lb=0.0)
     problem = projected(qp, 12)
-    B, ritz, C = problem.model(1e4), problem.spectrum.ritz, problem.rows.C
-    dense = B.tau * np.eye(60) + B.U.T @ np.diag(B.w) @ B.U
+    ritz, C = problem.spectrum.ritz, problem.rows.C
+    solver = driver.outer_loop(problem, qp, SMALBE(preconditioner="model")).solver
     known = (ritz.values + ritz.residuals)[:10] / problem.spectrum.norm
 
-    assert dense @ C.T == pytest.approx(1e4 * C.T, abs=1e-8)
-    assert dense @ ritz.vectors[:10].T == pytest.approx(
-        known * ritz.vectors[:10].T, abs=1e-9
-    )
-    assert B.tau < 1 / 100
-    assert B.U @ B.U.T == pytest.approx(np.eye(len(B.U)), abs=1e-12)
+    def inverse(rows):
+        free = np.full(60, True)
+        return np.array([solver.precondition(free, v, 1e4) for v in rows])
+
+    assert inverse(C) == pytest.approx(C / 1e4, abs=1e-8)
+    vectors = ritz.vectors[:10]
+    assert known[:, None] * inverse(vectors) == pytest.approx(vectors, abs=1e-6)
+    rest = problem.rows.project(rng.standard_normal(60))
+    rest -= vectors.T @ (vectors @ rest)
+    tau = (rest @ rest) / (rest @ inverse([rest])[0])
+    assert tau < 1 / 100
 
 
 @pytest.mark.parametrize(
@@ -312,23 +326,14 @@ def test_too_few_steps_are_not_called_solved(dual):
     assert "step limit" in s.message
 
 
-@pytest.mark.parametrize(
-    ("orders", "bounds", "is_compiled"),
-    [
-        *((orders, bounds, True) for orders in (6, 9) for bounds in (False, True)),
-        (6, True, False),
-        *(pytest.param(*row, False, marks=pytest.mark.slow)
-          for row in [(6, False), (9, False), (9, True)]),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("orders", [6, 9])
+@pytest.mark.parametrize("bounds", [False, True])
 def test_a_tolerance_beyond_rounding_ends_in_the_residual_that_was_reached(
-    orders, bounds, is_compiled, monkeypatch
+    orders, bounds
 ):
     """The eigenvalues are 1 … 10^orders, and no point in double precision has the
     required residual.
     """
-    if not is_compiled:
-        monkeypatch.setattr(driver, "outer_loop", loop.outer_loop)
     rng, n = np.random.default_rng(1), 60
     Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
     P = (Q * np.logspace(0, orders, n)) @ Q.T
@@ -382,7 +387,7 @@ def test_the_carried_gradient_is_the_gradient(outer_loop, dual, growth, rounding
     end = outer_loop(problem, M=10.0, growth=growth, tol=1e-6)
     C = problem.rows.C
 
-    fresh = problem.H(end.nu, end.rho) - problem.b + C.T @ end.mu
+    fresh = hessian(problem, end.rho) @ end.nu - problem.b + C.T @ end.mu
     assert end.g == pytest.approx(fresh, abs=rounding)
 
 
@@ -390,7 +395,7 @@ def test_the_projected_problem_is_normalised_and_projected(dual):
     qp = dual(271828)
     problem = projected(qp, 30)
     C = problem.rows.C
-    H = np.column_stack([problem.H(v, 0.0) for v in np.eye(30)])
+    H = hessian(problem, 0.0)
 
     assert C @ C.T == pytest.approx(np.eye(3), abs=1e-14)
     assert np.linalg.norm(H, 2) == pytest.approx(1, rel=1e-6)
@@ -415,42 +420,29 @@ def test_a_short_lanczos_process_bounds_the_norm_closely_from_above(seed):
     H = W @ W.T
     norm = np.linalg.norm(H, 2)
 
-    ritz = lanczos(lambda v: H @ v, rng.standard_normal(60), 12)
+    ritz = lanczos(H, rng.standard_normal(60), 12)
     distances = abs(np.linalg.eigvalsh(H)[:, None] - ritz.values).min(axis=0)
 
     assert norm * (1 - 1e-12) <= ritz.norm <= 1.25 * norm
     assert (distances <= ritz.residuals * (1 + 1e-9)).all()
-    assert ritz.vectors @ ritz.vectors.T == pytest.approx(np.eye(12), abs=1e-12)
+    V = ritz.vectors  # empty if the first pair has not converged
+    assert V @ V.T == pytest.approx(np.eye(len(V)), abs=1e-12)
 
 
 def test_the_norm_of_a_low_rank_operator_ends_early():
     u = np.arange(1.0, 6.0)
 
-    assert lanczos(lambda v: u * (u @ v), u + 1, 5).norm == pytest.approx(u @ u)
+    assert lanczos(np.outer(u, u), u + 1, 5).norm == pytest.approx(u @ u)
 
 
 def test_lanczos_ends_early_where_all_ritz_values_are_of_one_size():
     rng = np.random.default_rng(271828)
-    flat, steep = np.linspace(1, 8, 40), np.logspace(0, -2, 40)
+    flat, steep = np.diag(np.linspace(1, 8, 40)), np.diag(np.logspace(0, -2, 40))
     start = rng.standard_normal(40)
 
-    assert lanczos(lambda v: flat * v, start, 12).values.size == 5
-    assert lanczos(lambda v: steep * v, start, 12).values.size == 12
-    assert lanczos(lambda v: flat * v, start, 12).norm >= 8
-
-
-def test_the_power_method_stops_at_its_tolerance():
-    """For eigenvalues 1 and 1/2, each product reduces the error by a factor of 4, to
-    10⁻⁴ in a few products.
-    """
-    products = []
-
-    def H(v):
-        products.append(v)
-        return v * [1.0, 0.5]
-
-    assert power_method(H, 2) == pytest.approx(1.0, abs=1e-4)
-    assert 5 <= len(products) <= 10
+    assert lanczos(flat, start, 12).values.size == 5
+    assert lanczos(steep, start, 12).values.size == 12
+    assert lanczos(flat, start, 12).norm >= 8
 
 
 def test_inequality_rows_are_declined_with_an_alternative(manufactured):
@@ -554,11 +546,11 @@ def test_the_residual_of_the_original_problem_decides(dual, tol, seeds):
     """The residual of the projected problem may be smaller."""
     for seed in seeds:
         qp = dual(seed)
-        for name, most in (("smalbe", tol), ("smalbe-permon", 5 * tol)):
+        for name in ("smalbe", "smalbe-permon"):
             s = SOLVERS[name].prepare(qp, tol)()
 
             assert s.status is Status.SOLVED
-            assert relative_residual(qp, s, tol) <= most * (1 + 1e-9)
+            assert relative_residual(qp, s, tol) <= tol * (1 + 1e-9)
 
 
 def test_multipliers_leave_no_gradient_that_rows_could_take(dual):
@@ -595,7 +587,7 @@ def mixed(P, q, lb, ub, A, b):
     return bounded(P, q, A, b, lb=np.asarray(lb), ub=np.asarray(ub))
 
 
-@pytest.mark.parametrize("name", INHOUSE)
+@pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed", "smalbe-direct"])
 @pytest.mark.parametrize(
     "qp",
     [

@@ -44,13 +44,15 @@ def proves_unbounded(qp: QP, v: Vector) -> bool:
 
     The conditions are Pv = 0, qᵀv < 0, Av = 0 and Gv ≤ 0, with vᵢ ≥ 0 if lbᵢ is finite
     and vᵢ ≤ 0 if ubᵢ is finite. These conditions do not imply that a feasible point
-    exists.
+    exists. An operator P without a known diagonal has no size with which Pv could be
+    compared; the result is then False.
     """
-    if not v.any() or not np.isfinite(v).all():
+    diagonal = qp.diagonal()
+    if diagonal is None or not v.any() or not np.isfinite(v).all():
         return False
     v = v / np.abs(v).max()
     v = np.where(np.abs(v) <= ROUNDING, 0.0, v)
-    is_flat = np.abs(_times(qp.P, v)).max() <= ROUNDING * np.abs(qp.P.diagonal()).max()
+    is_flat = np.abs(_times(qp.P, v)).max() <= ROUNDING * np.abs(diagonal).max()
     equalities_hold = np.abs(_times(qp.A, v)) <= ROUNDING * _sizes(
         qp.A, np.ones(v.size)
     )
