@@ -37,8 +37,6 @@ _MIN_CURVATURE = -1e-6
 #: Smallest diagonal entry used for scaling, relative to the largest entry of P. Smaller
 #: entries may consist mostly of rounding errors.
 _MIN_DIAGONAL = 1e-4
-#: number of rows of P that are compared with Pᵀ at a time, to save memory
-_STRIP_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -504,21 +502,12 @@ def _triangle(P: Matrix) -> str:
 
 def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
     """Return the indices (i, j) and the value of the largest entry of |P − Pᵀ|."""
-    if issparse(P):
-        difference = coo_array(abs(P - P.T))
-        if not difference.nnz:
-            return (0, 0), 0.0
-        at = int(difference.data.argmax())
-        i, j = (int(k[at]) for k in difference.coords)
-        return (i, j), float(difference.data[at])
-    place, worst = (0, 0), 0.0
-    for begin in range(0, len(P), _STRIP_ROWS):
-        strip = slice(begin, begin + _STRIP_ROWS)
-        difference = abs(P[strip] - P[:, strip].T)
-        i, j = np.unravel_index(difference.argmax(), difference.shape)
-        if difference[i, j] > worst:
-            place, worst = (begin + int(i), int(j)), float(difference[i, j])
-    return place, worst
+    difference = coo_array(abs(P - P.T))
+    if not difference.nnz:
+        return (0, 0), 0.0
+    at = int(difference.data.argmax())
+    i, j = (int(k[at]) for k in difference.coords)
+    return (i, j), float(difference.data[at])
 
 
 def canonical(M: Matrix) -> Matrix:

@@ -332,6 +332,7 @@ def option_types(solver: Solver, key: str) -> tuple[Any, ...]:
 def in_words(names: Iterable[str]) -> str:
     """Return the names of types as words for a message.
 
+    >>> from mortarbench.harness.registry import in_words
     >>> in_words(["int", "NoneType"])
     'an integer or none'
 

@@ -174,8 +174,9 @@ def source(root: Path) -> dict[str, Any] | None:
     if not (root / ".git").exists():
         return None
     try:
-        commit = git("rev-parse", "HEAD").decode().strip()
-        if not git("status", "--porcelain", "--", *_CODE):
+        status = git("status", "--porcelain=v2", "--branch", "--", *_CODE).decode()
+        commit = status.partition("\n")[0].rpartition(" ")[2]
+        if all(line.startswith("#") for line in status.splitlines()):
             return {"commit": commit, "dirty": False, "changes": None}
         # an external diff tool configured by the user would change the digest
         changes = [git("diff", "--no-ext-diff", "HEAD", "--", *_CODE)]

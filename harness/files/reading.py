@@ -2,8 +2,8 @@
 
 A file must be regular, since a device or a pipe may never end. The file must also
 declare its size, which files in /proc do not. The content must be UTF-8, must not
-exceed a limit that users can raise, and must not be nested too deeply. All functions
-raise an `InputError` that states where the error is and what was expected.
+exceed a limit, and must not be nested too deeply. All functions raise an `InputError`
+that states where the error is and what was expected.
 """
 
 from __future__ import annotations
@@ -23,10 +23,8 @@ import msgspec
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import FULL
 
-#: environment variable that sets the size limit of text files, in MiB
-VARIABLE = "MORTARBENCH_TEXT_MIB"
-MAX_TOML_MIB = 1.0  #: default limit for TOML; a file of this size takes 1 s to parse
-MAX_JSON_MIB = 64.0  #: default limit for other text files
+MAX_TOML_MIB = 1  #: limit for TOML files; a file of this size takes 1 s to parse
+MAX_JSON_MIB = 64  #: limit for other text files
 MAX_LEVELS = 50  #: largest depth of nesting
 
 #: A dotted TOML key with more than `MAX_LEVELS` components. Such a key is rejected
@@ -74,21 +72,17 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
 
 
 def read_text(
-    path: Path, expected: str = "a text file", most: float = MAX_JSON_MIB
+    path: Path, expected: str = "a text file", most: int = MAX_JSON_MIB
 ) -> str:
     """Read a text file.
 
     expected : description of the file, for messages
-    most : limit in MiB, unless the environment variable sets another limit
+    most : limit of the size in MiB
     """
-    limit = _limit(most)
     with opened(path, expected) as file:
-        data = file.read(int(limit * 2**20) + 1)
-    if len(data) > limit * 2**20:
-        raise InputError(
-            f"{path}: larger than {limit:g} MiB; expected {expected}, or set "
-            f"{VARIABLE} to a higher limit"
-        )
+        data = file.read(most * 2**20 + 1)
+    if len(data) > most * 2**20:
+        raise InputError(f"{path}: larger than {most} MiB; expected {expected}")
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -155,19 +149,3 @@ def _refuse_deep(data: object) -> None:
 
 def _too_deep() -> InputError:
     return InputError(f"nested too deeply; expected at most {MAX_LEVELS} levels")
-
-
-def _limit(most: float) -> float:
-    """Return the size limit in MiB: the environment variable if set, else `most`."""
-    text = os.environ.get(VARIABLE)
-    if text is None:
-        return most
-    try:
-        limit = float(text)
-    except ValueError:
-        limit = 0.0
-    if not 0 < limit < 2**20:
-        raise InputError(
-            f"{VARIABLE} = {text!r}; expected a number of MiB, such as 100"
-        )
-    return limit

@@ -8,7 +8,7 @@ import pytest
 from mortarbench.cli.main import main
 from mortarbench.harness import InputError
 from mortarbench.harness.errors import one_line, shown
-from mortarbench.harness.files.reading import VARIABLE, read_json, read_toml, toml
+from mortarbench.harness.files.reading import read_json, read_toml, toml
 from mortarbench.harness.names import parse
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.journal import read_journal
@@ -161,7 +161,7 @@ def test_deeply_nested_or_malformed_toml_is_refused(text, expected):
         toml(text)
 
 
-def test_text_files_are_regular_utf_8_and_not_too_large(tmp_path, monkeypatch):
+def test_text_files_are_regular_utf_8_and_not_too_large(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     large = tmp_path / "large.toml"
     large.write_bytes(b"#" * 2_000_000)
@@ -174,12 +174,6 @@ def test_text_files_are_regular_utf_8_and_not_too_large(tmp_path, monkeypatch):
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"{wrong}.*; expected a TOML file"):
             read_toml(tmp_path / path)
-
-    monkeypatch.setenv(VARIABLE, "3")
-    assert read_toml(large) == {}
-    monkeypatch.setenv(VARIABLE, "lots")
-    with pytest.raises(InputError, match="expected a number of MiB, such as 100"):
-        read_toml(large)
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,7 @@ from mortarbench.reports.sections import compose
 from mortarbench.solvers import SOLVERS
 from tests.support import damaged_files, damaged_texts, synthetic_results
 from tests.support.bounded import bounded
+from tests.support.gmsh_files import stacked_blocks
 
 FEW, MANY = 30, 1000
 COUNTS = pytest.mark.parametrize(
@@ -72,65 +73,6 @@ zip = [["Nr", "Nh"]]
 family = "hertz-plane"
 params = { n = 4, load = [1.0, 2.5] }
 sequence = "load"
-"""
-BODIES = """\
-mesh = "two.msh"
-plane = "strain"
-contact = "nts"
-basis = "dual"
-steps = 10
-units = { length = 2.0, force = 1e8 }
-[[bodies]]
-name = "low"
-E = 200e9
-nu = 0.3
-[[bodies]]
-name = "high"
-E = 1e9
-nu = 0.25
-[[supports]]
-boundary = "floor"
-fix = ["x", "y"]
-[[loads]]
-boundary = "top"
-traction = [0.0, -1e6]
-[[contacts]]
-slave = "under"
-master = "over"
-"""
-MESH = """\
-$MeshFormat
-2.2 0 8
-$EndMeshFormat
-$PhysicalNames
-6
-1 1 "floor"
-1 2 "over"
-1 3 "under"
-1 4 "top"
-2 5 "low"
-2 6 "high"
-$EndPhysicalNames
-$Nodes
-8
-1 0 0 0
-2 1 0 0
-3 1 1 0
-4 0 1 0
-5 0 1.1 0
-6 1 1.1 0
-7 1 2 0
-8 0 2 0
-$EndNodes
-$Elements
-6
-1 1 2 1 1 1 2
-2 1 2 2 2 3 4
-3 1 2 3 3 5 6
-4 1 2 4 4 7 8
-5 3 2 5 5 1 2 3 4
-6 3 2 6 6 5 6 7 8
-$EndElements
 """
 NAMES = (
     "beam-ring/Nr=30/Nh=15/step=10/dual", "hertz-plane/n=4/load=2.5/primal",
@@ -176,12 +118,11 @@ def test_a_damaged_suite_is_read_or_refused(tmp_path, count):
 
 @COUNTS
 def test_a_damaged_description_of_bodies_is_read_or_refused(tmp_path, count):
-    (tmp_path / "two.msh").write_text(MESH)
-    chance, path = random.Random(count), tmp_path / "bodies.toml"
-    path.write_text(BODIES)
-    assert assemble_stiffness(read_bodies(path, "strain")).K.shape == (16, 16)
+    path, chance = stacked_blocks(tmp_path), random.Random(count)
+    sound = path.read_text()
+    assert assemble_stiffness(read_bodies(path, "strain")).K.nnz
     for _ in range(count):
-        text = damaged_texts.damaged(BODIES, chance)
+        text = damaged_texts.damaged(sound, chance)
         written(path, text)
         tried(text, lambda: assemble_stiffness(read_bodies(path, "strain")))
 

@@ -82,10 +82,6 @@ def test_a_wildcard_entry_takes_the_text_after_the_colon_as_backend():
     assert resolve(spec("open:anything"), SOLVERS) == Open(backend="anything")
 
 
-def test_an_exact_entry_takes_precedence_over_the_wildcard():
-    assert resolve(spec("open:tuned"), SOLVERS).alpha == 9.0
-
-
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
@@ -112,13 +108,6 @@ def test_an_invalid_solver_is_reported_in_one_line(asked, message):
     assert "\n" not in str(e.value)
 
 
-def test_options_are_all_fields_with_their_values():
-    assert options_of(Method(max_iter=9)) == {
-        "max_iter": 9, "alpha": 1.5, "scaling": True, "mode": "fast", "seed": None
-    }  # fmt: skip
-    assert options_of(object()) == {}
-
-
 PLUGIN = """
 from __future__ import annotations
 from dataclasses import dataclass
@@ -141,18 +130,6 @@ def test_a_file_with_a_frozen_dataclass_is_a_plugin(tmp_path):
 
     assert options_of(plugin.solvers["mine-9"]) == {"tries": 9}
     assert plugin.problems == {}
-
-
-def test_plugins_of_the_same_file_name_do_not_mix(tmp_path):
-    files = [tmp_path / folder / "plug.py" for folder in "ab"]
-    for tries, file in enumerate(files):
-        file.parent.mkdir()
-        file.write_text(PLUGIN.replace("= 3", f"= {tries}"))
-
-    solvers = [load_plugin(file).solvers["mine"] for file in files]
-
-    assert [s.tries for s in solvers] == [0, 1]
-    assert type(solvers[0]).__module__ != type(solvers[1]).__module__
 
 
 FAMILY = """
@@ -214,16 +191,6 @@ def test_an_invalid_plugin_is_reported_in_one_line(tmp_path, text, message):
 
     assert str(e.value).startswith(f"{file}: {message}")
     assert "\n" not in str(e.value)
-
-
-def test_a_plugin_that_fails_to_import_leaves_no_module(tmp_path):
-    file = tmp_path / "half.py"
-    file.write_text("raise RuntimeError")
-
-    with pytest.raises(InputError):
-        load_plugin(file)
-
-    assert not [name for name in sys.modules if "plugin_half" in name]
 
 
 def test_a_plugin_that_is_missing_or_not_a_python_file_is_refused(tmp_path):
@@ -346,14 +313,6 @@ def test_the_worker_of_a_labelled_solver_loads_its_own_plugin_first(tmp_path):
         command = registries.worker_command(spec(f"{label}:mine"))
         (first, _) = json.loads(command[-1])["plugins"]
         assert first.startswith(f"{label}=")
-
-
-def test_a_changed_neighbour_module_is_imported_again(tmp_path):
-    file = version(tmp_path / "v", 1)
-    load_plugin(file)
-    (tmp_path / "v" / "constants.py").write_text("VERSION = 345")
-
-    assert load_plugin(file).solvers["mine"].declines(None) == "late 1 345 fast 1"
 
 
 def test_modules_beside_a_plugin_replace_no_loaded_module(tmp_path):

@@ -1,6 +1,6 @@
 """Operations of convex sets, compared with definitions; QPs with several sets."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -15,7 +15,6 @@ from mortarbench.harness import (
     InputError,
     Solution,
     Status,
-    save_qp,
 )
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.verify.measure import SolverError, reason_to_decline
@@ -103,24 +102,6 @@ def test_the_hull_is_the_smallest_box_around_a_set(one):
                 assert sign * far >= 1e9 * 1e-16
             else:
                 assert far == pytest.approx(max(min(bound, 1e9), -1e9))
-
-
-def test_projections_on_cones_are_exact():
-    """For ‖t‖ ≤ ¾n, the projection of (0, 3, 4) is n = 2.4, t = 1.8·(0.6, 0.8)."""
-    cone = Cones([[0, 1, 2]], [0.75])
-    for x, nearest in [
-        ([0, 3, 4], [2.4, 1.08, 1.44]),
-        ([-3, 2.4, 3.2], [0, 0, 0]),  # on the polar cone, ¾‖t‖ = −n
-        ([4, 0, 3], [4, 0, 3]),
-        ([0, 0, 0], [0, 0, 0]),
-        ([-1, 0, 0], [0, 0, 0]),
-    ]:
-        assert cone.project(np.array(x, dtype=float)) == pytest.approx(nearest)
-    halfline = Cones([[0, 1]], [0.0])
-    assert halfline.project(np.array([2.0, 5.0])).tolist() == [2.0, 0.0]
-    assert halfline.project(np.array([-2.0, 5.0])).tolist() == [0.0, 0.0]
-    assert halfline.admissible(np.array([-2.0, 5.0])).tolist() == [-2.0, 5.0]
-    assert halfline.admissible(np.array([2.0, 5.0])).tolist() == [0.0, 5.0]
 
 
 @pytest.mark.parametrize("slope", [1e-150, 1e-8, 1.0, 1e8, 1e150])
@@ -217,25 +198,6 @@ def qp_with(*sets, **parts):
 FREE = Box.unbounded(N)
 
 
-def test_the_first_set_is_the_box_of_the_bounds():
-    given = qp_with(lb=BOX.lower, ub=BOX.upper)
-    assert isinstance(given.sets[0], Box)
-    assert given.sets[0].lower is given.lb is BOX.lower
-    assert qp_with(BOX).ub is BOX.upper
-    assert np.isinf(qp_with().lb).all()
-    assert not given.lb.flags.writeable
-
-
-def test_bounds_are_replaced_and_other_sets_are_kept():
-    qp = qp_with(FREE, BALLS)
-    bounded = replace(qp, lb=np.where(np.arange(N) == 0, 0.0, -INF))
-    assert bounded.lb[0] == 0
-    assert bounded.ub is qp.ub
-    assert bounded.sets[1] is BALLS
-    assert replace(qp, q=2 * qp.q).sets == qp.sets
-    assert qp.with_bounds(bounded.lb, qp.ub).sets[1] is BALLS
-
-
 @pytest.mark.parametrize(
     ("sets", "message"),
     [
@@ -250,15 +212,6 @@ def test_bounds_are_replaced_and_other_sets_are_kept():
 def test_sets_that_do_not_fit_are_refused(sets, message):
     with pytest.raises(ValueError, match=message):
         qp_with(*sets)
-
-
-def test_a_box_among_the_sets_of_from_arrays_is_refused():
-    arrays = dict(P=np.eye(N), q=np.ones(N))
-    with pytest.raises(
-        InputError, match="expected a tuple of convex sets in addition to"
-    ):
-        QP.from_arrays(**arrays, sets=(BOX,))
-    assert QP.from_arrays(**arrays, sets=(BALLS,)).sets[1] is BALLS
 
 
 @dataclass(frozen=True)
@@ -292,12 +245,6 @@ def test_a_declaration_other_than_a_tuple_of_classes_is_named(accepts):
     solver = type("Odd", (Careless,), {"accepts": accepts})()
     with pytest.raises(SolverError, match="expected a tuple of classes, such as"):
         reason_to_decline(solver, qp_with(BOX))
-
-
-def test_files_refuse_sets_that_they_cannot_store(tmp_path):
-    with pytest.raises(InputError, match="cannot be stored in files; expected bounds"):
-        save_qp(tmp_path / "a.npz", qp_with(FREE, BALLS))
-    assert not list(tmp_path.iterdir())
 
 
 def test_discs_of_one_variable_are_bounds_to_the_last_bit():

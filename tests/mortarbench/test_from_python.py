@@ -458,53 +458,28 @@ def test_the_conformance_suite_accepts_a_solver_object():
             lambda: mb.solve(QP, object()),
             "an object with the methods declines and prep",
         ),
-        (lambda: mb.solve(QP, "clarable"), "did you mean 'clarabel'"),
         (
             lambda: mb.solve(QP, "clarabel", "1e-6"),
             "tol = '1e-6'; expected a number be",
         ),
-        (lambda: mb.solve(QP, "clarabel", True), "tol = True; expected a number"),
-        (lambda: mb.solve(QP, "clarabel", tol=None), "tol = None; expected a number"),
         (
             lambda: mb.solve(QP, "clarabel", options={5: 5}),
             "options = {5: 5}; expected",
         ),
         (
-            lambda: mb.solve(QP, "clarabel", options=["a"]),
-            r"options = \['a'\]; expected",
-        ),
-        (lambda: mb.solve(QP, "clarabel", options={"a": 5}), "unknown option 'a'"),
-        (
             lambda: mb.solve(QP, "clarabel", plugins="a.py"),
             "expected a list of Python f",
         ),
-        (
-            lambda: mb.solve(QP, "clarabel", plugins=[5]),
-            "plugins = 5; expected a path",
-        ),
         (lambda: mb.solve(QP, "clarabel", ranks="2"), "ranks = '2'; expected a number"),
-        (lambda: mb.verify(QP, None), "x is missing; expected an array of numbers"),
         (lambda: mb.verify(QP, [1, 2, 3]), r"x has shape \(3,\); expected \(2,\)"),
         (lambda: mb.verify(QP, [1, 2], z=[1, 2]), r"z has shape \(2,\); expected \(1,"),
-        (lambda: mb.verify(QP, "ab"), "x is of type <U2; expected an array of numbers"),
-        (lambda: mb.verify(5, [1]), "case = 5; expected the name of a case"),
-        (lambda: mb.verify(QP, [1, 2], tol=0), "tol = 0; expected a number between"),
-        (lambda: mb.export(QP, 5), "path = 5; expected a path"),
         (lambda: mb.export(QP, "a.txt"), "unknown format '.txt'; expected .npz or"),
-        (lambda: mb.export(5, "a.npz"), "case = 5; expected the name of a case"),
-        (lambda: mb.replay("nowhere", "abc"), "nowhere"),
         (lambda: mb.replay(None, "abc"), "folder = None; expected a path"),
-        (lambda: mb.replay("nowhere", 5), "run_id = 5; expected a nonempty string"),
         (
             lambda: mb.solve(QP, "clarabel", time_limit=0),
             "time_limit = 0; expected a positive number",
         ),
-        (
-            lambda: mb.test_solver("clarabel", time_limit="1"),
-            "time_limit = '1'; expected a positive number",
-        ),
         (lambda: mb.test_solver(5), "solver: 5 is of type int; expected a solver"),
-        (lambda: mb.test_solver("clarable"), "did you mean 'clarabel'"),
     ],
 )
 def test_an_argument_of_the_wrong_type_is_refused_with_the_expected_type(call, message):

@@ -327,20 +327,6 @@ def test_a_form_that_all_solvers_call_infeasible_is_refuted_by_other_forms(
     assert (code, culprits(verdict)) == (1, {"denies"})
 
 
-def test_failing_mechanics_do_not_remove_the_residuals(duplicate):
-    def factorise():
-        raise ZeroDivisionError("no factor")
-
-    mechanics = replace(duplicate.mechanics, factorise=factorise)
-    answers = [stored_answer(replace(duplicate, mechanics=mechanics), k, pushed(z))
-               for k, z in {"good": (1.5, 0.0), "bad": (1.6, 0.0)}.items()]  # fmt: skip
-
-    found = compare_answers(answers, reference_solution)
-
-    assert [a.outcome for a in found] == ["not validated", "refuted"]
-    assert "no factor" in found[0].text
-
-
 def test_a_stored_point_that_was_changed_afterwards_is_noticed(truths, tmp_path, cli):
     _, s = truths[2, "dual-bounds"]
     answers = [(label, f"{BEAM}/dual-bounds", s) for label in HONEST]

@@ -20,7 +20,7 @@ from scipy.sparse import csc_matrix
 
 from mortarbench.cli.main import main
 from mortarbench.harness import QP, InputError, no_rows
-from mortarbench.harness.files.datafile import MIB, VARIABLE, check_size
+from mortarbench.harness.files.datafile import VARIABLE
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.problems import PROBLEMS
@@ -268,13 +268,6 @@ HOSTILE_NPZ = [
 ]
 
 
-def test_a_size_just_above_the_limit_is_not_rounded_down_to_the_limit(monkeypatch):
-    monkeypatch.setenv(VARIABLE, "8")
-    check_size("the file", 8 * MIB)
-    with pytest.raises(InputError, match=r"would take 9 MiB.*at most 8"):
-        check_size("the file", 8 * MIB + 1)
-
-
 def test_an_archive_that_expands_is_refused_before_it_is_read(
     tmp_path, monkeypatch, cheaply
 ):
@@ -364,36 +357,6 @@ def test_numbers_that_define_no_qp_are_named(tmp_path, cheaply, write, message):
     with pytest.raises(InputError, match=message) as caught:
         build(tmp_path / "a.npz")
     assert len(str(caught.value)) < 500
-
-
-TWO = {
-    "q": np.ones(2), "G": csc_matrix((0, 2)), "h": np.zeros(0), "A": csc_matrix((0, 2)),
-    "b": np.zeros(0), "lb": np.zeros(2), "ub": np.ones(2),
-}  # fmt: skip
-
-
-def test_entries_in_any_order_are_added_up(tmp_path):
-    """P[0, 0] = 2 is stored as 0.5 + 1.5, after the entry of row 1."""
-    parts = {
-        "P_data": np.array([1.0, 0.5, 1.5, 2.0]), "P_indices": np.array([1, 0, 0, 1]),
-        "P_indptr": np.array([0, 3, 4]), "P_shape": np.array([2, 2]),
-    }  # fmt: skip
-    parts["P_data"][0] = 0.0
-    qp = QP(**{k: no_rows(2) if k in "GA" else v for k, v in TWO.items()}, P=np.eye(2))
-    save_qp(tmp_path / "a.npz", qp, {})
-    with np.load(tmp_path / "a.npz") as stored:
-        np.savez(tmp_path / "b.npz", **{**stored, **parts, "meta": np.array("{}")})
-
-    P = build(tmp_path / "b.npz").qp.P
-    np.testing.assert_array_equal(P.toarray(), 2 * np.eye(2))
-
-
-def test_rounding_does_not_make_p_unsymmetric(tmp_path):
-    P = np.array([[1.0, 1 / 3], [1 / 3 * (1 + 1e-15), 1.0]])
-    qp = QP(**{k: no_rows(2) if k in "GA" else v for k, v in TWO.items()}, P=P)
-    save_qp(tmp_path / "a.npz", qp, {})
-
-    assert build(tmp_path / "a.npz").qp.q.size == 2
 
 
 @pytest.mark.parametrize(

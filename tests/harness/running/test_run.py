@@ -26,7 +26,6 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
 from mortarbench.harness.suite.suite import Suite
-from mortarbench.reports.measurements import read_measurements
 from tests.support import ADVERSARIES
 
 PLUGIN = ADVERSARIES
@@ -125,7 +124,7 @@ OUTCOMES = {
         "failed",
         "ValueError: first line second line (adversaries.py:110)",
     ),
-    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:133)"),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:115)"),
     "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
     "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
     "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
@@ -152,7 +151,7 @@ OUTCOMES = {
     "zero": (Verdict.WRONG, "solved", None),
     "mutates": (
         Verdict.FAILED, "failed",
-        "ValueError: assignment destination is read-only (adversaries.py:370)",
+        "ValueError: assignment destination is read-only (adversaries.py:316)",
     ),
     # the timed solves are those of another QP, and the last one is judged
     "mutatesbyforce": (Verdict.FAILED, "failed", ""),
@@ -250,16 +249,6 @@ def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
     assert {r.iterations for r in records if r.solver == "honest"} == {1}
 
 
-def test_a_sequence_and_a_cold_solve_of_a_case_are_two_measurements(measure, tmp_path):
-    both = three_steps("honest")
-    measure(replace(both, cases=both.sequences[0][:1]))
-    first = [r for r in read_journal(tmp_path) if r.params["h"] == 0.5]
-
-    assert {r.mode for r in first} == {"cold", "sequence"}
-    assert len({r.run_id for r in first}) == 2
-    assert set(read_measurements(tmp_path).answers["mode"]) == {"cold", "sequence"}
-
-
 def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_path):
     cases = ({"h": 0.5}, {"h": 1.0}, {"fault": "end"}, {"fault": "end", "h": 0.5})
     names = tuple(assemble("tiny", FAMILIES["tiny"], case, "plain") for case in cases)
@@ -275,16 +264,6 @@ def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_pa
     assert len(read_journal(tmp_path)) == 8  # no measurement is missing
 
 
-def test_a_broken_sequence_names_the_step(measure, tmp_path):
-    measure(three_steps("breaksitschain"))
-
-    records = read_journal(tmp_path)
-    assert [r.status for r in records] == [
-        Verdict.VERIFIED, Verdict.CRASHED, Verdict.CRASHED,
-    ]  # fmt: skip
-    assert records[2].message == "the sequence ended at tiny/plain: exit code 9"
-
-
 def test_an_interrupted_sequence_is_repeated_from_its_first_step(measure, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         measure(three_steps("chains"), interrupt_after=2)
@@ -293,17 +272,6 @@ def test_an_interrupted_sequence_is_repeated_from_its_first_step(measure, tmp_pa
     records = read_journal(tmp_path)
     assert [r.iterations for r in records] == [1, 2, 3]
     assert len({r.run_id for r in records}) == 3
-
-
-def test_answers_of_a_sweep_are_verified_at_one_accuracy(measure, tmp_path):
-    sweep = suite("honest", "zero", tolerances=(0.1, 1e-8), accuracy=1e-6)
-    measure(sweep)
-
-    records = read_journal(tmp_path)
-    assert {(r.tol, r.accuracy, r.solver, r.status) for r in records} == {
-        (0.1, 1e-6, "honest", Verdict.VERIFIED), (0.1, 1e-6, "zero", Verdict.WRONG),
-        (1e-8, 1e-6, "honest", Verdict.VERIFIED), (1e-8, 1e-6, "zero", Verdict.WRONG),
-    }  # fmt: skip
 
 
 def test_repeats_are_cold_and_the_state_is_stored_for_the_first_only(measure, tmp_path):
@@ -353,21 +321,6 @@ def test_a_case_that_cannot_be_built_is_reported_and_retried(
         assert len(watched.records) + watched.skipped == watched.total
     assert "Traceback" in caplog.text
     assert all(entry.levelno < logging.WARNING for entry in caplog.records)
-
-
-@pytest.mark.parametrize(
-    ("fault", "note"),
-    [
-        ("quantities", "no quantities: ZeroDivisionError: no quantity"),
-        ("fields", "no fields: ZeroDivisionError: no field"),
-    ],
-)
-def test_a_failing_evaluation_only_adds_a_note(measure, tmp_path, fault, note):
-    measure(suite("honest", cases=[{"fault": fault}]))
-    (r,) = read_journal(tmp_path)
-
-    assert (r.status, r.message) == (Verdict.VERIFIED, note)
-    assert r.vectors is not None
 
 
 def test_another_suite_or_environment_is_refused_unless_fresh(measure, tmp_path):
@@ -610,18 +563,4 @@ def test_a_worker_killed_between_two_steps_of_a_sequence_loses_no_step(
 ):
     measure(three_steps("chains"), after=1, act=lambda: kill_worker("chains"))
 
-    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
-
-
-def test_measured_steps_of_a_sequence_prevented_by_faults_are_kept(
-    measure, tmp_path, faults
-):
-    faults(lambda record: record.params["h"] == 1.0)
-    watched = measure(three_steps("chains"))
-    cases = [fault.split()[2] for fault in watched.faults]
-    assert cases == ["tiny/plain:", "tiny/h=1.5/plain:"]
-    assert (len(watched.records), watched.skipped, watched.total) == (1, 2, 3)
-
-    faults(lambda record: False)
-    measure(three_steps("chains"))
     assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]

@@ -28,11 +28,6 @@ class Method:
 
 
 @dataclass(frozen=True)
-class Timed(Method):
-    time_limit: int = 1
-
-
-@dataclass(frozen=True)
 class Well(Family):
     forms: ClassVar = ("primal", "dual")
 
@@ -79,17 +74,6 @@ def load(tmp_path):
 
 def names(suite):
     return [case.name for case in suite.cases]
-
-
-def test_missing_keys_take_their_defaults(load):
-    suite = load(MINIMAL)
-
-    assert suite.name == "demo"
-    assert suite.tolerances == (1e-6,)
-    assert (suite.repeats, suite.time_limit, suite.memory_limit) == (3, 60.0, 4096.0)
-    assert suite.solvers == (SolverSpec(name="osqp", label="osqp"),)
-    assert names(suite) == ["well/primal", "well/dual"]
-    assert suite.text == MINIMAL
 
 
 def test_a_suite_contains_the_values_of_the_file(load):
@@ -263,22 +247,6 @@ def test_patterns_choose_cases_in_the_suite_s_order(narrowed):
     assert names(chosen) == ["well/n=2/dual", "well/n=12/primal", "well/n=12/dual"]
 
 
-@pytest.mark.parametrize(
-    "written", ["well/n=2/kind=soft/dual", "well/m=1/n=+2/dual", "well/n=2/dual"]
-)
-def test_a_case_may_be_named_in_any_way_that_parses(narrowed, written):
-    assert names(narrowed(cases=[written])) == ["well/n=2/dual"]
-
-
-def test_a_pattern_without_a_match_is_refused_with_the_cases(narrowed):
-    with pytest.raises(InputError) as e:
-        narrowed(cases=["well/n=3/dual"])
-
-    assert str(e.value).endswith(
-        "its cases are well/n=2/primal, well/n=2/dual, well/n=12/primal and 1 more"
-    )
-
-
 def test_only_limits_change_the_text_of_a_suite(narrowed):
     before = narrowed()
     after = narrowed(time_limit=2.5, memory_limit=100, repeats=1, cases=["*/dual"])
@@ -288,20 +256,6 @@ def test_only_limits_change_the_text_of_a_suite(narrowed):
         "time_limit": 2.5, "memory_limit": 100
     }  # fmt: skip
     assert narrowed(repeats=1, solvers=["osqp"]).text == before.text
-
-
-@pytest.mark.parametrize("head", ["", "time_limit = 7\n"])
-def test_a_limit_of_the_suite_cannot_be_set_as_a_solver_option(load, head):
-    text = head + (
-        "name = 'demo'\n[[solvers]]\nname = 'osqp'\n"
-        "[solvers.options]\nmax_iter = 3\ntime_limit = 9\n" + BLOCK
-    )
-    solvers = {"osqp": Timed()}
-    suite = load(text, solvers)
-
-    after = with_overrides(suite, FAMILIES, solvers, time_limit=2.5)
-
-    assert tomllib.loads(after.text) == tomllib.loads(text) | {"time_limit": 2.5}
 
 
 @pytest.mark.parametrize(
@@ -326,25 +280,6 @@ def test_an_invalid_override_is_refused(narrowed, changes, message):
 def shipped(name):
     path = ROOT / "suites" / f"{name}.toml"
     return load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
-
-
-def paths_of(suite):
-    return [c.params["path"] for c in suite.cases if "path" in c.params]
-
-
-def test_files_of_a_suite_are_searched_here_and_then_beside_the_suite(
-    tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    elsewhere = paths_of(shipped("crossval"))
-    monkeypatch.chdir(ROOT / "suites")
-    here = paths_of(shipped("crossval"))
-
-    assert set(here) == {
-        "crossval/punch.toml", "crossval/hs76.qps", "crossval/boxes.hdf5"
-    }  # fmt: skip
-    assert all(path.endswith(name) for path, name in zip(elsewhere, here, strict=True))
-    assert all((tmp_path / path).is_file() for path in elsewhere)
 
 
 def folder_of_files(folder, monkeypatch, *, here=True):
@@ -411,14 +346,6 @@ def test_a_sequence_may_run_along_zipped_keys():
     ] == [[(step, newton) for step in range(1, 11) for newton in range(1, 5)]] * 2
 
 
-def test_a_pattern_keeps_all_steps_of_a_sequence_or_none():
-    kept = with_overrides(
-        shipped("path"), problems.PROBLEMS, solvers.SOLVERS, cases=["*/step=3/dual"]
-    )
-
-    assert [[c.form for c in s] for s in kept.sequences] == [["dual"] * 10]
-
-
 @pytest.mark.parametrize("key", ["'dim'", "'m'"])
 def test_a_sequence_along_no_list_is_refused(tmp_path, key):
     file = tmp_path / "s.toml"
@@ -443,15 +370,6 @@ def test_lines_of_a_grid_differ_in_one_list_only(load):
     assert load(MINIMAL).lines == ()
 
 
-def test_zipped_keys_form_one_line(load):
-    suite = load(
-        MINIMAL + 'forms = ["dual"]\nparams = { n = [2, 4], m = [3, 5] }\n'
-        'zip = [["n", "m"]]'
-    )
-
-    assert suite.lines == (("well/n=2/m=3/dual", "well/n=4/m=5/dual"),)
-
-
 def test_a_list_among_the_options_spans_a_grid_of_labelled_solvers(load):
     suite = load(
         'name = "demo"\nsolvers = ["osqp", { name = "other", label = "mine", '
@@ -469,18 +387,6 @@ def test_a_list_among_the_options_spans_a_grid_of_labelled_solvers(load):
             for n in (5, 6)
             for eps in (0.001, 1e-06)
         ),
-    ]
-
-
-def test_a_list_that_is_a_value_of_the_option_is_one_value(load):
-    suite = load(
-        'name = "demo"\nsolvers = [{ name = "other", options = { parts = [1, 2] } }]\n'
-        + BLOCK,
-        {"other": Tuned()},
-    )
-
-    assert [(s.label, s.options) for s in suite.solvers] == [
-        ("other", {"parts": [1, 2]})
     ]
 
 
