@@ -233,8 +233,6 @@ def _md_table(table: Table) -> str:
 
 # LaTeX
 
-#: packages that the tables need
-PACKAGES = r"\usepackage{booktabs}"
 _TEX = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&",
     "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
@@ -249,9 +247,11 @@ _TEX = {
 def latex(tables: Sequence[Table], *, intervals: bool = True) -> str:
     r"""Return tables in 9 pt for a column of 12 cm, for ``\input`` in an article.
 
+    No packages are needed.
+
     intervals : False to omit the second lines of the cells
     """
-    return "\n".join([f"% {PACKAGES}", *(_tex_table(t, intervals) for t in tables)])
+    return "\n".join(_tex_table(table, intervals) for table in tables)
 
 
 def _tex_table(table: Table, intervals: bool) -> str:
@@ -266,14 +266,14 @@ def _tex_table(table: Table, intervals: bool) -> str:
     return "\n".join(
         [
             r"\begin{table}",
-            r"  \centering\small\setlength{\tabcolsep}{4pt}",
+            r"  \centering\small\setlength{\tabcolsep}{3pt}",
             rf"  \caption{{{_tex(table.caption)}}}\label{{tab:{table.name}}}",
             rf"  \begin{{tabular}}{{@{{}}{columns}@{{}}}}",
-            r"    \toprule",
+            r"    \hline",
             "    " + " & ".join(map(_tex, table.head)) + r" \\",
-            r"    \midrule",
+            r"    \hline",
             *(f"    {line}" for line in lines),
-            r"    \bottomrule",
+            r"    \hline",
             r"  \end{tabular}",
             r"\end{table}",
             "",

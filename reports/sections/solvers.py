@@ -44,7 +44,7 @@ GROUPS = {
     "declined": (Verdict.DECLINED,),
 }  # fmt: skip
 MOST_FAILURES = 12  #: largest number of rows in the table of failures
-MOST_SIZES = 7  #: largest number of sizes in a table of times
+MOST_SIZES = 5  #: largest number of sizes in a table of times
 MOST_HISTORIES = 2  #: largest number of cases whose histories are drawn
 LEAST_PROFILE = 4  #: smallest number of cases of a performance profile
 
@@ -142,14 +142,14 @@ def _times_of(run: Measurements, form: str, of: pd.DataFrame) -> Table:
                 short_name(solver),
                 *cells,
                 number(count) if np.isfinite(count) else ABSENT,
-                number(error, 2),
+                number(error, 1),
                 law(growth_of(solved)).replace(" ", "\n", 1),
             )
         )
     tol, named = tolerance(float(of.tol.min())), short_name(form) or "QP"
     return Table(
         name=f"times-{stem(form) or 'qp'}",
-        head=("solver", *(f"m = {m:.0f}" for m in sizes), "iterations", "error", "p"),
+        head=("solver", *(f"m = {m:.0f}" for m in sizes), "iter.", "error", "p"),
         rows=tuple(lines),
         caption=f"Form {named}, tolerance {tol}: median time of preparation and "
         "solve by the size m of the dual, with the 95 % interval of the median below "
@@ -183,7 +183,8 @@ def _time(at: pd.DataFrame, raw: pd.DataFrame) -> str:
         return seconds(middle.value)
     shown = seconds(middle.value)
     scale = middle.value / float(shown.split()[0])
-    return f"{shown}\n[{number(middle.low / scale)}, {number(middle.high / scale)}]"
+    low, high = (number(end / scale, 2) for end in (middle.low, middle.high))
+    return f"{shown}\n[{low}, {high}]"
 
 
 def scaling(run: Measurements, rows: list[Row]) -> Iterator[Item]:
