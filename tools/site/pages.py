@@ -253,7 +253,9 @@ def python_page() -> str:
         "Further names for plug-ins": [
             f"harness.{n}" for n in sorted(set(harness.__all__) - set(own))
         ],
-        "Elastic bodies in plug-ins": [f"problems.elastic.{n}" for n in elastic.__all__],
+        "Elastic bodies in plug-ins": [
+            f"problems.elastic.{n}" for n in elastic.__all__
+        ],
     }
     return "\n\n".join(
         [
