@@ -9,10 +9,8 @@ import pytest
 import yaml
 
 from mortarbench.answer import solve
-from mortarbench.case import build
 from mortarbench.cli.main import command_parser, main
 from mortarbench.harness import (
-    InputError,
     Residuals,
     Status,
     verdict,
@@ -23,7 +21,6 @@ from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.verify import measure
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.listing import about
-from mortarbench.problems import elastic
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.registries import Registries
 from mortarbench.reports.answer import COMPLETE

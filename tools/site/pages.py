@@ -262,7 +262,7 @@ def python_page() -> str:
             "# Python names",
             "**Which names may a script use?** Those on this page are stable; others "
             "may change. For invalid input, all functions raise `mb.InputError` with a "
-            "one-line message. [From Python](python.md) shows how to use them together.",
+            "message of one line. [From Python](python.md) shows how to use them.",
             *(
                 "\n".join([f"## {title}\n", *(f"::: mortarbench.{n}" for n in names)])
                 for title, names in groups.items()
