@@ -12,7 +12,7 @@ BIN := .venv/bin
 BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip \
     cvxpy:CLARABEL cvxpy:HIGHS
 
-.PHONY: help setup browser demo test mutants bench docs site weaknesses size synthetic check clean
+.PHONY: help setup browser demo test mutants bench site weaknesses size synthetic check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -52,9 +52,6 @@ mutants: setup  ## make small changes to chosen modules; their tests must fail (
 bench: setup  ## time our own kernels (pytest-benchmark)
 	$(BIN)/pytest benchmarks --benchmark-warmup=on \
 	    --benchmark-sort=name --benchmark-columns=min,median,iqr,rounds
-
-docs: setup  ## write docs/solvers*.md from the adapters
-	@$(BIN)/python tools/catalogue.py
 
 weaknesses: setup  ## measure effects of equivalent formulations, for the site (minutes)
 	@mkdir -p out

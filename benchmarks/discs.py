@@ -37,7 +37,7 @@ from mortarbench.harness.operators import assembled
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.baselines import projected_gradient
-from mortarbench.solvers.smalbe import driver
+from mortarbench.solvers.smalbe import driver, textbook
 from mortarbench.solvers.smalbe.compiled import Product
 
 TOL = 1e-8
@@ -87,12 +87,15 @@ def perturbed_norm(factor: float) -> Iterator[None]:
 
     def norm(name: str, estimate: Any, *args: Any, **keys: Any) -> Any:
         result = estimate(*args, **keys)
+        if not name:
+            return result * factor
         power = -1 if name == "alpha" else 1
         return result._replace(**{name: getattr(result, name) * factor**power})
 
     with ExitStack() as stack:
         for module, function, name in (
             (driver, "by_lanczos", "norm"),
+            (textbook, "lanczos", ""),
             (projected_gradient, "_start", "alpha"),
         ):
             estimate = partial(norm, name, getattr(module, function))

@@ -1,4 +1,4 @@
-"""Tables of docs/performance-smalbe.md: costs of SMALBE relative to its products.
+"""Costs of SMALBE relative to its products, and races with other solvers.
 
     python -m benchmarks.smalbe_costs dense|sparse|incomplete|subdomains|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]

@@ -62,6 +62,8 @@ class Verdict(StrEnum):
     def is_verified(self) -> bool:
         """True if a solution, or a claim that none exists, was verified.
 
+        Examples
+        --------
         >>> from mortarbench import Verdict
         >>> [v.value for v in Verdict if v.is_verified]
         ['verified', 'verified_infeasible', 'verified_unbounded']

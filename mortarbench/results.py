@@ -310,7 +310,7 @@ def run(
         a list, each value in the list is measured
     fresh : delete the previous results in the folder first
     dask : measure on the workers of the Dask scheduler at this address, or (``local``)
-        of a scheduler that is started on this machine; see docs/cluster.md
+        of a scheduler that is started on this machine; see docs/compare.md
     plugins : Python files with more solvers or families
     progress : True for a bar, or for lines if stderr is not a terminal; a function to
         be called with every `Event`; False for no display; None for a bar in a notebook

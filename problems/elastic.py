@@ -1,8 +1,8 @@
 """Building blocks of elastic families in plug-ins; the names in `__all__` are stable.
 
 Mesh the bodies, `join` them, `assemble` them with supports, load and contact pairs, and
-obtain the QP from `one_step`. See docs/plugins.md for a complete family. Lengths are in
-m, moduli and tractions in Pa, forces in N per m of thickness.
+obtain the QP from `one_step`. Lengths are in m, moduli and tractions in Pa, forces in N
+per m of thickness.
 
 For example, one steel block is pressed onto another::
 

@@ -1,4 +1,4 @@
-"""Measure the tables of docs/smalbe-products.md and write them into the page.
+"""Measure the counts of products in docs/performance.md, and write them into the page.
 
     python tools/products.py [PATTERN]...     only cases that match a shell pattern
 
@@ -26,7 +26,7 @@ from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 
-PAGE = Path(__file__).parents[1] / "docs" / "smalbe-products.md"
+PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
 PRESETS = ("smalbe-permon", "smalbe-espreso")
 HEAD = re.compile(r"(?:`([^`]+)`|best preset) (1e-\d+)(?: (warm))?")
 CASE = re.compile(r"`([\w-]+/[^`]*)`")

@@ -119,7 +119,7 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
                 raise InputError(
                     f"{path}: {shortened(name)} is a pickled Python object, which is "
                     "never read; expected an array of numbers (for a sparse matrix, "
-                    "toarray(), or its parts as in docs/plugins.md)"
+                    "toarray(), or its parts P_data, P_indices, P_indptr, P_shape)"
                 ) from None
         return arrays
 

@@ -5,7 +5,7 @@
 environment in which it is built, so that each version of the code has its own entry.
 Both files are checked by digests when they are read, and a case is built again if one
 of them is damaged. Digests are not signatures: anyone who can write to the folder can
-store a different QP under the name of a case (docs/security.md).
+store a different QP under the name of a case (docs/policy.md).
 """
 
 from __future__ import annotations

@@ -384,6 +384,8 @@ def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
 
     axis : 0, 1, … selects the components along one axis; None selects all
 
+    Examples
+    --------
     >>> dofs_of(np.array([0, 3]), 2).tolist(), dofs_of(np.array([0, 3]), 2, 1).tolist()
     ([0, 1, 6, 7], [1, 7])
     """

@@ -19,7 +19,7 @@ rows of G, Q = CᵀC, 𝒫 = I − Q, c = Cx̃, the shortest x̃ with Gx̃ = e, 
     minimise ½xᵀAx − bᵀx  subject to  Cx = c, x ∈ Ω,
     A = 𝒫F𝒫/N,   b = 𝒫(d − Fx̃)/N.
 
-The variable is x, where the codes use ν = x − x̃; the iterates are the same.
+The variable is x, where the codes use ν = x − x̃, so that Ω is not shifted.
 """
 
 from __future__ import annotations
@@ -75,9 +75,8 @@ class Textbook:
 
     The loop ends when ‖g^P‖ ≤ tol‖b‖ and ‖Cx − c‖ ≤ tol·max(‖x̃‖, ‖b‖) for the
     normalised QP. If the relative KKT residual of the QP then exceeds tol, the loop
-    continues with a smaller tolerance.
-    The counts of products depend on rounding, which decides which of several nearly
-    degenerate bounds is met first.
+    continues with a smaller tolerance. The counts of products depend on rounding, which
+    decides which of several nearly degenerate bounds is met first.
     """
 
     expansion: Expansion = "std"
@@ -141,10 +140,9 @@ class Textbook:
         return lambda: _solve_to_tolerance(problem, self, tol, history)
 
 
-#: PERMON 3.25: SMALXE with MPGP. (M₁ = 100‖A‖, ρ = 1.1‖A‖, ᾱ = 2/‖A‖, ‖A‖ by power
-#: method)
+#: defaults of PERMON 3.25 (SMALXE with MPGP), relative to ‖A‖
 PERMON = Textbook(reduced=False, alpha=2.0, rho=1.1, M=100.0, norm="power")
-#: ESPRESO: SMALBE with MPRGP
+#: defaults of ESPRESO, relative to ‖A‖
 ESPRESO = Textbook(
     expansion="mixed", proportioning="projection", alpha=2.0, beta=0.8, eta=1.0,
     norm="power",

@@ -9,10 +9,8 @@ import pytest
 import yaml
 
 from mortarbench.answer import solve
-from mortarbench.case import build
 from mortarbench.cli.main import command_parser, main
 from mortarbench.harness import (
-    InputError,
     Residuals,
     Status,
     verdict,
@@ -23,7 +21,6 @@ from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.verify import measure
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.listing import about
-from mortarbench.problems import elastic
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.registries import Registries
 from mortarbench.reports.answer import COMPLETE
@@ -31,23 +28,25 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT
 
-sys.path.append(str(ROOT / "tools"))
-from solver_pages import solvers_pages  # tools/solver_pages.py, which writes the pages
+sys.path.append(str(ROOT / "tools" / "site"))
+import pages as site  # the hook of mkdocs
 
 DOCUMENTS = [
     *sorted((ROOT / "docs").glob("*.md")),
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
 ]
 
-#: pages of the site that are generated from code
-GENERATED = {"families.md", "records.md"}
+
+def code_of(page, name):
+    """Return the file `name` that a page shows."""
+    text = (ROOT / "docs" / page).read_text("utf-8")
+    (code,) = re.findall(rf"<!-- file: {name} -->\n```python\n(.*?)```", text, re.S)
+    return code
 
 
-def test_the_solver_of_the_contributing_guide_solves(tmp_path):
+def test_the_solver_of_the_page_for_authors_solves(tmp_path):
     """The solver has fewer than 30 lines and solves a dual with bounds only."""
-    _, code = re.findall(
-        r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
-    )
+    code = code_of("own-solver.md", "lbfgsb.py")
     path = tmp_path / "lbfgsb.py"
     path.write_text(code)
     solver = load_plugin(path).solvers["lbfgsb"]
@@ -64,40 +63,12 @@ def test_the_solver_of_the_contributing_guide_solves(tmp_path):
     )
 
 
-def test_the_elastic_family_of_the_plug_in_page_is_valid(tmp_path):
-    """In both forms, the contact force of the stamp balances its pressure, and the
-    energies are equal. The table of the page lists all names of `elastic`.
-    """
-    page = (ROOT / "docs/plugins.md").read_text("utf-8")
-    (code,) = re.findall(r"<!-- file: stamp.py -->\n```python\n(.*?)```", page, re.S)
-    path = tmp_path / "stamp.py"
-    path.write_text(code)
-    energies = []
-    for form in ("primal", "dual"):
-        case = build(f"stamp/n=3/width=0.8/{form}", plugins=[path])
-        s = SOLVERS["clarabel"].prepare(case.qp, 1e-10)()
-        found = case.quantities(s)
-        force = found["contacts"]["stamp on block"]["force"]
-        energies.append(found["energy"])
-        assert kkt_residuals(case.qp, s).worst <= 1e-9
-        assert force["stamp"] == pytest.approx([0, 8e5], abs=1)
-        assert found["contacts"]["stamp on block"]["half_width"] <= 0.4 + 1e-9
-    assert energies[0] == pytest.approx(energies[1], rel=1e-8)
-    with pytest.raises(InputError, match="stamp: n=0 must be at least 1"):
-        build("stamp/n=0/dual", plugins=[path])
-    table = page.partition("may be relied on")[2].partition("## What")[0]
-    rows = "".join(re.findall(r"^\| (`.*?) \|", table, re.M))
-    assert set(re.findall(r"`(\w+)`", rows)) == set(elastic.__all__)
-
-
 def test_the_steps_that_their_page_shows_solve(tmp_path):
     """The steps converge with the default damping factor and with the factors 0, 0.7
     and 1.
     """
-    page = (ROOT / "docs/own-steps.md").read_text("utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
     path = tmp_path / "damped.py"
-    path.write_text(code)
+    path.write_text(code_of("own-solver.md", "damped.py"))
     for options in ({}, {"damping": 0.0}, {"damping": 0.7}, {"damping": 1.0}):
         answer = solve("string/n=60/primal", "damped", plugins=[path], options=options)
         assert str(answer.verdict) == "verified"
@@ -105,21 +76,8 @@ def test_the_steps_that_their_page_shows_solve(tmp_path):
         assert answer.solution.counts["expansion"] > 0
 
 
-def test_the_adapter_that_the_contributing_guide_shows_is_the_real_one():
-    shown, _ = re.findall(
-        r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
-    )
-    assert shown == (ROOT / "solvers/adapters/piqp_.py").read_text()
-
-
-def test_the_pages_of_solvers_are_up_to_date():
-    """The pages equal the output of `make docs`."""
-    for name, text in solvers_pages(SOLVERS).items():
-        assert (ROOT / "docs" / name).read_text("utf-8") == text
-
-
 def test_the_page_of_solvers_states_the_facts_of_each():
-    page = "\n".join(solvers_pages(SOLVERS).values())
+    page = site.GENERATED["solvers.md"]()
     for name, solver in SOLVERS.items():
         assert f"| `{name}` |" in page
         facts = about(solver)
@@ -135,17 +93,30 @@ def test_the_page_of_solvers_states_the_facts_of_each():
 def test_every_family_and_suite_that_commands_name_exists():
     from mortarbench.problems import PROBLEMS
 
-    pages = [ROOT / "README.md", ROOT / "docs" / "commands.md"]
-    text = "".join(page.read_text("utf-8") for page in pages)
+    text = "".join(page.read_text("utf-8") for page in DOCUMENTS)
 
     names = re.findall(r"mortarbench solve ([\w-]+)[/:]", text)
-    assert {"beam-ring", "contact-patch", "file"} <= set(names) <= set(PROBLEMS)
+    assert {"beam-ring", "contact-patch", "bodies"} <= set(names) <= set(PROBLEMS)
     for suite in re.findall(r"suites/[\w-]+\.toml", text):
         assert (ROOT / suite).is_file()
 
 
-def test_the_readme_is_at_most_120_lines():
-    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 120
+def test_the_documents_are_a_book_of_two_hours():
+    """At most 22 pages in docs/, 40 000 words in all, and a start page of 500."""
+    words = {p.name: len(p.read_text("utf-8").split()) for p in DOCUMENTS}
+
+    assert len(list((ROOT / "docs").glob("*.md"))) <= 22
+    assert sum(words.values()) <= 40_000
+    assert words["README.md"] <= 500
+
+
+def test_a_page_opens_with_its_question_and_a_command():
+    """The question is in bold; a block of commands or a session follows early."""
+    for page in DOCUMENTS:
+        text = page.read_text("utf-8")
+        if page.name in ("CHANGELOG.md", "glossary.md"):
+            continue
+        assert re.match(r"# .+\n\n\*\*[^*]+\?\*\*", text), page
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.stem)
@@ -181,7 +152,7 @@ def test_every_file_that_a_page_names_exists():
         lost = [n for n in named if not (ROOT / n).exists() and "NAME" not in n]
         assert lost == [], page
         links = re.findall(r"\]\((?!\w+:)([^)#]+)", text)
-        links = [n for n in links if n not in GENERATED]
+        links = [n for n in links if n not in site.GENERATED]
         assert [n for n in links if not (page.parent / n).exists()] == [], page
 
 
@@ -193,7 +164,7 @@ def test_every_page_has_a_place_on_the_site():
     folder = ROOT / "docs"
     found = {p.name for p in folder.glob("*.md")}
     found |= {f"gallery/{p.stem}.md" for p in folder.glob("gallery/*.ipynb")}
-    made = {"index.md", "contributing.md", "changelog.md", *GENERATED}
+    made = {"index.md", "contributing.md", "changelog.md", *site.GENERATED}
 
     assert set(re.findall(r": (\S+\.md)$", nav, re.M)) == found | made
 
@@ -213,7 +184,7 @@ def workflow():
 def test_the_workflow_for_ci_calls_existing_commands():
     commands = [words[1:] for words in workflow() if words[0] == "mortarbench"]
 
-    assert [words[0] for words in commands] == ["test-solver", "run", "run", "report"]
+    assert [words[0] for words in commands] == ["test-solver", "run", "report"]
     for words in commands:
         assert command_parser(words).parse_known_args(words)[1] == []
 
@@ -229,25 +200,19 @@ def test_the_workflow_for_ci_passes_with_a_new_solver(tmp_path, monkeypatch, cap
 
     for first, *words in workflow():
         if first == "mortarbench":
-            by_chance = (
-                words[0] == "report"
-            )  # exits with 1 by chance, in at most 5 % of runs
-            allowed = {0, 1} if by_chance else {0}
+            # both versions are equal: whether this can be told depends on the noise
+            allowed = {0, 1, 2} if words[0] == "report" else {0}
             assert main(Registries(), words) in allowed, (words, capsys.readouterr())
-    assert (tmp_path / "out/ci/new/report/against-base/index.html").is_file()
+    assert (tmp_path / "out/ci/report/compared/index.html").is_file()
 
 
 def test_the_citation_is_of_this_version_and_names_the_paper():
-    """CITATION.cff and the BibTeX entry of the README agree."""
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
-    bibtex = (ROOT / "README.md").read_text("utf-8").partition("```bibtex\n")[2]
-    fields = dict(re.findall(r"^  (\w+) += \{(.*)\},$", bibtex, re.M))
     (paper,) = citation["references"]
 
     assert citation["cff-version"] == "1.2.0"
-    assert citation["version"] == fields["version"] == version("mortarbench")
-    assert citation["title"] == re.sub("[{}]", "", fields["title"])
-    assert citation["license"] == fields["license"] == "BSD-3-Clause"
+    assert citation["version"] == version("mortarbench")
+    assert citation["license"] == "BSD-3-Clause"
     assert paper["doi"] == "10.4203/ccc.9.10.5"
     assert [a["family-names"] for a in paper["authors"]] == [
         "Pospíšil", "Světlík", "Varga", "Čermák",
@@ -256,13 +221,13 @@ def test_the_citation_is_of_this_version_and_names_the_paper():
 
 def test_the_comparison_policy_agrees_with_the_code():
     """The sentences are numbered without gaps and state the constants of the code."""
-    page = (ROOT / "docs/fair-play.md").read_text("utf-8")
+    page = (ROOT / "docs/policy.md").read_text("utf-8")
     sentences = dict(
         re.findall(r"^- <span id=\"s(\d+)\">\*\*\1\.\*\*</span> (.*)", page, re.M)
     )
     libraries = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "RAYON")
 
-    assert list(sentences) == [str(n) for n in range(1, 43)]
+    assert list(sentences) == [str(n) for n in range(1, 42)]
     assert {f"{name}_NUM_THREADS": "1" for name in libraries} == ONE_THREAD
     assert "OpenMP, OpenBLAS, MKL, BLIS, NumExpr and Rayon" in sentences["25"]
     assert f"up to {measure.MAX_ASSEMBLED_ROWS} rows" in sentences["13"]
@@ -271,7 +236,7 @@ def test_the_comparison_policy_agrees_with_the_code():
     assert f"more than {measure.MAX_UNTIMED_SECONDS:g} s" in sentences["22"]
     assert measure.REMEMBERED_SPEEDUP == 5
     assert "more than five times as long" in sentences["21"]
-    assert "at most ten times the tolerance" in sentences["33"]
+    assert "at most ten times the tolerance" in sentences["32"]
     assert VERIFIED_FACTOR == 10
     assert verdict(Status.ITERATION_LIMIT, Residuals(0, 0, 0, 0), 1e-6).is_verified
-    assert f"at least {100 * COMPLETE:g} % of the cases" in sentences["40"]
+    assert f"at least {100 * COMPLETE:g} % of the cases" in sentences["37"]

@@ -25,50 +25,26 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 
-_SMALL = "--case '*Nr=4/Nh=3/step=1/*'"
-
 #: shorter commands that are run instead
 SHORTER = {
-    "mortarbench run demo": f"mortarbench run demo {_SMALL} --repeats 2",
-    "mortarbench run demo --out out/demo-again": (
-        f"mortarbench run demo {_SMALL} --repeats 2 --out out/demo-again"
+    "mortarbench run demo": (
+        "mortarbench run demo --case '*Nr=4/Nh=3/step=1/*' --repeats 2"
     ),
-    "mortarbench run scaling": (
-        "mortarbench run scaling --case '*Nr=[468]/*/dual' --repeats 1 --solver smalbe"
+    "mortarbench run mine.toml": "mortarbench run mine.toml --repeats 2",
+    "mortarbench run mine.toml --out out/again": (
+        "mortarbench run mine.toml --repeats 2 --out out/again"
     ),
-    "mortarbench run crossval": (
-        "mortarbench run crossval --case 'contact-patch/*' --solver smalbe "
-        "--solver clarabel"
+    # two folders of equal times decide the gate
+    "mortarbench report out/sizes out/more --fail-on worse,slower=1.2": (
+        "mortarbench report out/sizes out/sizes --fail-on worse,slower=1.2"
     ),
-    "mortarbench run suites/crossval.toml --out out/crossval": (
-        "mortarbench run suites/crossval.toml --out out/crossval "
-        "--case 'contact-patch/*' --solver smalbe --solver clarabel"
+    "mortarbench report out/versions --compare old:mine,new:mine "
+    "--fail-on worse,slower=1.2": (
+        "mortarbench report out/versions --compare old:mine,new:mine"
     ),
     "mortarbench run suites/crossover.toml --out out/crossover": (
         "mortarbench run suites/crossover.toml --out out/crossover --repeats 1 "
         "--case 'cube-wall/n=6/dual' --solver smalbe"
-    ),
-    "mortarbench run suites/accuracy.toml": (
-        "mortarbench run suites/accuracy.toml --repeats 1 --case 'obstacle/*'"
-    ),
-    "mortarbench validate out/make-demo": "mortarbench validate out/demo",
-    "mortarbench run mine.toml": "mortarbench run mine.toml --repeats 2",
-    "mortarbench run profiles.toml": "mortarbench run profiles.toml --repeats 1",
-    "mortarbench run mine.toml --out out/again": (
-        "mortarbench run mine.toml --repeats 2 --out out/again"
-    ),
-    "mortarbench run suites/demo.toml --solver smalbe --solver osqp "
-    "--case '*Nr=4*/dual' --repeats 10 --out out/part": (
-        "mortarbench run suites/demo.toml --solver smalbe --solver osqp "
-        "--case '*Nr=4*step=1/dual' --repeats 2 --out out/part"
-    ),
-    "mortarbench run suites/demo.toml --solver smalbe --case '*/dual' --repeats 10": (
-        "mortarbench run suites/demo.toml --solver smalbe --case '*Nr=4*step=1/dual' "
-        "--repeats 2"
-    ),
-    "mortarbench run suites/scaling.toml": (
-        "mortarbench run suites/scaling.toml --case '*Nr=[468]/*/dual' --repeats 1 "
-        "--solver smalbe"
     ),
     "mortarbench run suites/scaling-feti.toml": (
         "mortarbench run suites/scaling-feti.toml --case 'membranes/S=[24]/*' "
@@ -78,28 +54,10 @@ SHORTER = {
         "mortarbench run finite-strain --solver smalbe --repeats 1 "
         "--case '*/step=1/*/dual'"
     ),
-    "mortarbench run suites/fleet.toml": (
-        "mortarbench run suites/fleet.toml --case '*Nr=4/Nh=3/dual' --solver pdas"
-    ),
-    "mortarbench solve beam-ring/Nr=30/Nh=15/dual --solver smalbe --tol 1e-9 "
-    "--plot beam.png --vtu beam.vtu": (
-        "mortarbench solve beam-ring/Nr=4/Nh=3/dual --solver smalbe --tol 1e-9 "
-        "--plot beam.png --vtu beam.vtu"
-    ),
-    "mortarbench export beam-ring/Nr=12/Nh=6/step=5/dual qp.npz": (
-        "mortarbench export beam-ring/Nr=4/Nh=3/step=5/dual qp.npz"
-    ),
-    "mortarbench report out/make-demo --format md,tex": (
-        "mortarbench report out/demo --format md,tex"
-    ),
-    "mortarbench report out/make-demo --factor 1": (
-        "mortarbench report out/demo --format md --factor 1"
-    ),
-    "mortarbench report out/make-demo --verbose": (
-        "mortarbench report out/demo --format md --verbose"
-    ),
-    "mortarbench report out/make-demo out/demo": (
-        "mortarbench report out/demo out/demo"
+    "mortarbench solve beam-ring/Nr=30/Nh=15/dual --solver smalbe-paper "
+    "--plot figure7.png": (
+        "mortarbench solve beam-ring/Nr=4/Nh=3/dual --solver smalbe-paper "
+        "--plot figure7.png"
     ),
 }
 
@@ -109,20 +67,14 @@ ELSEWHERE = {
     "make demo": "the environment exists; `mortarbench run demo` is tested",
     "make test": "it would run itself",
     ". .venv/bin/activate": "the environment is active",
+    ".venv/bin/lint-imports": "part of `make test`",
     "mortarbench paper --quick": "test_paper.py, with fewer samples",
-    "mortarbench replay out/make-demo RUN_ID": "test_replay.py; it needs a run_id",
-    "mortarbench run suites/demo.toml --dask tcp://HOST:8786": "test_cluster.py",
-    "mortarbench run fleet --dask tcp://login1:8786": "test_cluster.py",
-    "mortarbench run demo --dask local": "test_cluster.py",
+    "mortarbench replay out/demo RUN_ID": "it needs a run_id; docs/python.md",
+    "mortarbench replay out/sizes SESSION-RUN_ID": "the same",
     "mortarbench run ranks": "test_ranks.py, a smaller suite of ranks",
+    "mortarbench run fleet --dask tcp://login1:8786": "test_cluster.py",
     "mortarbench run fleet --dask tls://login1:8786": "test_cluster_tls.py",
-    "python cluster.py": "it submits jobs to a batch system",
-    "python benchmarks/ranks.py": "a measurement of minutes, in a checkout",
-    "mortarbench run fleet --out out/fleet --dask tcp://login1:PORT": "the same",
     "gmsh -2 -order 1 press.geo": "gmsh is not installed; its output is in tests/data",
-    ".venv/bin/python -m pip install -c constraints.txt -e '.[cluster]'": (
-        "the environment exists"
-    ),
 }
 #: files that programs outside of the test environment would write, by page
 SUPPLIED = {
@@ -134,7 +86,7 @@ PROMISED = {
         "beam.png": "",
         "out/mine/report/report.md": r"osqp-polish",
         "out/mine/report/records.parquet": "",
-        "out/again/report/against-mine/index.html": r"changes from mine to again",
+        "out/again/report/against-mine/index.html": r"mine to mine",
     },
     "own-bodies": {
         "press.png": "",
@@ -142,19 +94,14 @@ PROMISED = {
         "press-disc-on-upper.csv": "pressure_Pa",
         "blocks-upper-on-lower.csv": "pressure_Pa",
     },
-    "howto": {
-        "out/scaling/report/tables/scaling.tex": r"\d\.\d\d \[-?\d+\.\d+, \d+\.\d+\]",
-        "out/scaling/report/figures/scaling-1.pdf": "",
-        "out/profiles/report/figures/profiles-1.pdf": "",
-        "out/profiles/report/figures/pairwise-1.pdf": "",
-        "out/profiles/report/tables/contests.csv": r"all forms",
-        "out/profiles/report/report.md": r"Pooled forms: dual 6 cases, primal 6",
-        "out/crossval/validation.json": "",
-        "out/crossval/report/validation.html": r"No disagreement",
-        "out/demo/report/report.md": r"1 × tolerance",
-        "out/demo-again/report/against-demo/report.md": r"Verdicts: 0 worse",
-        "out/own/report/report.md": r"gradients: verified on all 2 cases",
+    "compare": {
+        "out/smoke/report/tables/answer.tex": r"\\begin\{tabular\}|longtable",
+        "out/sizes/report/report.md": r"residuals ≤ 1 × tol",
+        "out/sizes/report/compared/index.html": r"osqp to clarabel",
+        "out/more/report/against-sizes/report.md": r"before: osqp",
+        "out/sizes/report/validation.html": r"No disagreement",
     },
+    "own-solver": {"out/versions/report/compared/report.md": r"before: old:mine"},
 }
 _BEGIN = ("mortarbench ", "make ", "python ", ". .venv", ".venv/bin/")
 _LAST = re.compile(r"\s+#\s+exit code (\d)$")

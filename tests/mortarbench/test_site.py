@@ -23,11 +23,8 @@ SOURCES = {
         *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     )
 }
-#: pages with Unicode formulas: generated pages and the change log
-UNICODE = {
-    "solvers.md", "solvers-own.md", "solvers-libraries.md",
-    "CHANGELOG.md",
-}  # fmt: skip
+#: page with Unicode formulas
+UNICODE = {"CHANGELOG.md"}
 #: characters that occur only in formulas, not in plain text
 FORMULA = re.compile(r"[ᵀ‖½√∑Σ∫∂𝒫ᵢⱼₖ⁺λΩ\u0302\u0303]")
 CODE = re.compile(r"^```.*?^```$|`[^`]*`|<!--.*?-->", re.DOTALL | re.MULTILINE)
@@ -84,8 +81,8 @@ def test_every_formula_of_a_page_becomes_mathml(name):
 @cache
 def anchors_of(name):
     """Return the identifiers of a page to which links may point."""
-    generated = {"families.md": pages.family_page, "records.md": pages.record_page}
-    text = generated[name]() if name in generated else SOURCES[name].read_text("utf-8")
+    build = pages.GENERATED.get(name)
+    text = build() if build else SOURCES[name].read_text("utf-8")
     return set(re.findall(r' id="([^"]+)"', pages.typeset(rendered(text))))
 
 

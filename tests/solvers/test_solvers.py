@@ -108,7 +108,7 @@ def test_accuracy_does_not_depend_on_the_units(manufactured, name, energy, lengt
         b=qp.b * length, h=qp.h * length, lb=qp.lb * length, ub=qp.ub * length,
     )  # fmt: skip
     solution = solve(name, scaled, tol=1e-6)
-    if name == "highs" and length != 1:  # in docs/solvers-libraries.md
+    if name == "highs" and length != 1:  # stated by `about.limits`
         assert solution.message == "kSolveError"
         return
     assert solution.status is Status.SOLVED

@@ -1,10 +1,9 @@
 """Hooks of mkdocs for pages from sources other than docs/*.md, and for formulas.
 
 README, CONTRIBUTING and CHANGELOG become pages of the site. Notebooks in docs/gallery
-are executed and converted to pages. Annotations and docstrings yield the pages on
-families and records. The help text of each command is inserted into `commands.md`.
-Formulas, which the sources contain as LaTeX between dollar signs, are converted to
-MathML.
+are executed and converted to pages. Annotations, docstrings and help texts yield the
+pages on families, solvers, records, commands and Python names. Formulas, which the
+sources contain as LaTeX between dollar signs, are converted to MathML.
 """
 
 from __future__ import annotations
@@ -20,6 +19,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from math_core import LatexError, LatexToMathML
+
+from mortarbench.solvers import SOLVERS
+
+sys.path.append(str(Path(__file__).parent))
+from solver_page import solver_page
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -41,7 +45,6 @@ FORMULA = re.compile(
 )
 #: asterisk of a formula, as in u*, that Markdown has interpreted as emphasis
 SWALLOWED = re.compile(r"[\w|‖)\]']<em>.{0,60}")
-HELP = "<!-- help of every command -->"  #: placeholder in commands.md for help texts
 #: environment variables of notebooks and help texts: one thread, 80 columns
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "80"}
 
@@ -54,8 +57,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, page in PAGES.items():
         text = from_root((ROOT / name).read_text("utf-8"))
         files.append(File.generated(config, page, content=text))
-    files.append(File.generated(config, "families.md", content=family_page()))
-    files.append(File.generated(config, "records.md", content=record_page()))
+    for page, build in GENERATED.items():
+        files.append(File.generated(config, page, content=build()))
     if WEAKNESSES.is_file():
         content = WEAKNESSES.read_text("utf-8")
         files.append(File.generated(config, WEAKNESSES.name, content=content))
@@ -69,13 +72,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(
     markdown: str, *, page: Page, config: MkDocsConfig, files: Files
 ) -> str:
-    """Redirect links to files in the root and to notebooks, and insert help texts."""
+    """Redirect links to files in the root and to notebooks."""
     up = "../" * page.file.src_uri.count("/")
     for name, target in PAGES.items():
         markdown = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}{target}", markdown)
     if not page.file.src_uri.startswith("gallery/"):
         markdown = re.sub(r"\]\((gallery/[\w-]+)\.ipynb", r"](\1.md", markdown)
-    return markdown.replace(HELP, help_texts()) if HELP in markdown else markdown
+    return markdown
 
 
 def on_page_content(
@@ -212,17 +215,70 @@ def record_page() -> str:
     )
 
 
-def help_texts() -> str:
-    """Return the help texts of all commands, one section for each command."""
+def command_page() -> str:
+    """Return a page with the help texts of all commands."""
 
     def printed(*arguments: str) -> str:
         command = [sys.executable, "-m", "mortarbench", *arguments, "--help"]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-        return done.stdout
+        environment = {**os.environ, **ENVIRONMENT}
+        return subprocess.run(
+            command, check=True, capture_output=True, text=True, env=environment
+        ).stdout
 
     commands = re.findall(r"^    ([a-z-]+)(?: |$)", printed(), re.M)
-    sections = (f"### {c}\n\n```text\n{printed(c)}```\n" for c in commands)
-    return "\n".join(sections)
+    sections = (f"## {c}\n\n```text\n{printed(c)}```" for c in commands)
+    return "\n\n".join(
+        [
+            "# Commands",
+            "**Which options does a command have?** `mortarbench COMMAND --help` "
+            "prints these texts. [Exit codes](compare.md#exit-codes) are the same for "
+            "all commands.",
+            *sections,
+        ]
+    )
+
+
+def python_page() -> str:
+    """Return a page of directives from which mkdocstrings writes the reference."""
+    import mortarbench
+    from mortarbench import harness
+    from mortarbench.problems import elastic
+
+    # names whose packages of the same name can be called
+    paths = {name: f"listing.{name}" for name in ("solvers", "problems")}
+    own = [name for name in sorted(mortarbench.__all__) if name not in paths]
+    groups = {
+        "Functions": [n for n in own if n[0].islower()] + list(paths.values()),
+        "Classes": [n for n in own if n[0].isupper()],
+        "Further names for plug-ins": [
+            f"harness.{n}" for n in sorted(set(harness.__all__) - set(own))
+        ],
+        "Elastic bodies in plug-ins": [
+            f"problems.elastic.{n}" for n in elastic.__all__
+        ],
+    }
+    return "\n\n".join(
+        [
+            "# Python names",
+            "**Which names may a script use?** Those on this page are stable; others "
+            "may change. For invalid input, all functions raise `mb.InputError` with a "
+            "message of one line. [From Python](python.md) shows how to use them.",
+            *(
+                "\n".join([f"## {title}\n", *(f"::: mortarbench.{n}" for n in names)])
+                for title, names in groups.items()
+            ),
+        ]
+    )
+
+
+#: functions that return the generated pages, by the name of the page
+GENERATED = {
+    "commands.md": command_page,
+    "families.md": family_page,
+    "python-names.md": python_page,
+    "records.md": record_page,
+    "solvers.md": lambda: solver_page(SOLVERS),
+}
 
 
 def gallery_page(path: Path) -> dict[str, str | bytes]:

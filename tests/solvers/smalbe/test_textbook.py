@@ -21,6 +21,7 @@ from mortarbench.solvers.smalbe.textbook import (
     mprgp,
     power_method,
 )
+from tests.solvers.smalbe.test_hostile import ends
 from tests.support.discs import qp_on_discs
 
 NAMES = ["smalbe-textbook", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
@@ -359,3 +360,13 @@ def test_contact_forces_agree_with_those_of_the_textbook(case):
     forces = fast.x[bounded]
 
     assert slow.x[bounded] == pytest.approx(forces, abs=1e-5 * np.abs(forces).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1000, 1015))
+def test_no_claim_about_a_hostile_qp_is_wrong(seed):
+    """The QPs have solutions; see `tests.solvers.smalbe.test_hostile`."""
+    _, runs, wrong = ends("smalbe-textbook", [seed])
+
+    assert runs == 3
+    assert wrong == []

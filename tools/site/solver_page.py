@@ -1,11 +1,10 @@
-"""Text of the pages docs/solvers*.md, from the docstrings in solvers/."""
+"""Page of the site on the solvers, from the docstrings in solvers/."""
 
 from __future__ import annotations
 
 import ast
 import inspect
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from functools import cache
 from textwrap import dedent
 from typing import TYPE_CHECKING
@@ -19,75 +18,25 @@ if TYPE_CHECKING:
 HEAD = """\
 # Solvers
 
-**Which solvers are available, and which one should I choose?** `make docs` generates
-this page, the notes on [our solvers](solvers-own.md) and the notes on [solvers of
-libraries](solvers-libraries.md) from the docstrings in `solvers/`.
+**Which solvers are available, and which options do they have?** The docstrings in
+`solvers/` describe each solver, and how its adapter translates `tol`, the relative
+accuracy that all solvers receive, to the stopping test of its library. [Which
+solver](compare.md#which-solver) helps to choose.
 
-Every solver is called with the same `tol`, the relative KKT accuracy of the
-non-dimensional QP. The notes explain how each adapter translates `tol` to the stopping
-criterion of its solver. The status that a solver claims is recorded, but whether its
-answer is verified does not depend on this claim ([comparison policy](fair-play.md)).
-
-| your QP | try first |
-| --- | --- |
-| bounds and equality rows only, such as a dual | `smalbe` |
-| bounds and equality rows, dense, at most a few hundred unknowns | `smalbe-direct` |
-| inequality rows, such as a primal form | `piqp`, `clarabel` |
-| inequality rows, small and dense | `daqp` |
-| decomposed bodies (P is an operator) | `smalbe` |
-| load steps and other sequences | a solver with *yes* in the column "sequences" |
-
-`mortarbench test-solver NAME` runs the conformance suite on one of these solvers, or on
-your own solver with `--plugin FILE.py`. If the library of a solver is missing, the
-solver declines, and the message states the command that installs the library; `make
-setup` installs all libraries (the extra `fleet`).
-
-`make weaknesses` shows how the answers of each solver change with the units, with the
-order of unknowns and rows, with scaled or repeated rows, and with shifted or mirrored
-unknowns.
-"""
-OURS = """\
-# Our solvers
-
-`make docs` generates this page from the docstrings in `solvers/`; change the
-docstrings, not this file. [Solvers](solvers.md) lists all solvers.
-"""
-LIBRARIES = """\
-# Solvers of libraries
-
-`make docs` generates this page from the docstrings in `solvers/adapters/`; change the
-docstrings, not this file. [Solvers](solvers.md) lists all solvers and describes the
-interfaces `qpsolvers:NAME` and `cvxpy:NAME`.
+If the library of a solver is missing, the solver declines, and the message states the
+command that installs the library; `make setup` installs all libraries (the extra
+`fleet`). Beside the options listed here, a solver of a library has every setting of its
+library under the library's own name.
 """
 
 
-def solvers_pages(solvers: Mapping[str, Solver]) -> dict[str, str]:
-    """Return the Markdown pages on the solvers of a registry, by name of the file.
-
-    The first page contains the table of all solvers and the sections on solvers with a
-    selectable backend. The other two pages contain the sections on built-in solvers and
-    on solvers of libraries.
-    """
-    pages: dict[str, list[str]] = {
-        "solvers.md": [HEAD, *_overview(solvers)],
-        "solvers-own.md": [OURS],
-        "solvers-libraries.md": [LIBRARIES],
-    }
-    for kind, section in _sections(solvers).items():
-        if any(f.name == "backend" and f.default == "" for f in fields(kind)):
-            pages["solvers.md"].append(section)
-        elif ".adapters." in kind.__module__:
-            pages["solvers-libraries.md"].append(section)
-        else:
-            pages["solvers-own.md"].append(section)
-    return {name: "\n".join(parts) for name, parts in pages.items()}
-
-
-def _sections(solvers: Mapping[str, Solver]) -> dict[type, str]:
+def solver_page(solvers: Mapping[str, Solver]) -> str:
+    """Return the Markdown page on the solvers of a registry: a table, and sections."""
     groups: dict[type, list[str]] = {}
     for name, solver in solvers.items():
         groups.setdefault(type(solver), []).append(name)
-    return {kind: _section(kind, names, solvers) for kind, names in groups.items()}
+    sections = (_section(kind, names, solvers) for kind, names in groups.items())
+    return "\n".join([HEAD, *_overview(solvers), *sections])
 
 
 def _overview(solvers: Mapping[str, Solver]) -> Iterator[str]:
