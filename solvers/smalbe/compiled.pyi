@@ -63,6 +63,7 @@ class SMALBE:
         at: Iterate,
         infeasible: Callable[[Vector], bool],
         watch: Callable[[int, Vector], Callable[[str, Vector, Vector], None]] | None,
+        aim: float = 0.0,
     ) -> tuple[
         Vector,
         Vector,
@@ -72,19 +73,20 @@ class SMALBE:
         list[tuple[str, float, float, float, float]],
         Status,
     ]: ...
+    def estimate(self, at: Iterate, force: float, energy: float) -> float: ...
     def onto_rows(self, nu: Vector) -> Vector: ...
     def point(
         self, nu: Vector, mu: Vector, lb: Vector, ub: Vector
     ) -> tuple[Vector, Vector, Vector, Vector] | None: ...
 
-def relative_residual(
+def relative_residuals(
     qp: QP,
     s: Solution,
     tol: float,
     Px: Vector,
     diagonal: Vector,
     G: Matrix,
-) -> float: ...
+) -> tuple[float, float, float, float]: ...
 def orthonormal(
     G: Array, e: Vector
 ) -> tuple[

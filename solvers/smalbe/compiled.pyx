@@ -133,9 +133,6 @@ cdef extern from "vectors.h" nogil:
                            Py_ssize_t n)
     void transposed(const double *U, double *columns, Py_ssize_t k, Py_ssize_t n,
                     Py_ssize_t stride)
-    double inward_energy(const double *x, const double *g, const double *lower,
-                         const double *upper, const double *diagonal, double norm,
-                         double noise, Py_ssize_t n)
     void add_gram(const double *s, const double *V, const int *row, double *S,
                   Py_ssize_t k)
     void scaled(const double *root, const double *G, double tau, double *S,
@@ -207,14 +204,13 @@ cdef extern from "discs.h" nogil:
     void advance_discs(const discs *D, double alpha, double *x, double *g,
                        const double *p, const double *Hp, double tau, double *phi,
                        double *free, double *result)
+    void project_gradient_on_discs(const discs *D, const double *x, double *g)
     void chop_discs(const discs *D, const double *x, const double *g, double *beta)
     int mark_discs(const discs *D, const double *x, double *free)
     void tangential_discs(const discs *D, const double *x, const double *g,
                           const double *v, double *w)
     void step_on_discs(const discs *D, const double *x, const double *g, double length,
                        bint free_only, double *s, double *result)
-    double inward_energy_of_discs(const discs *D, const double *x, const double *g,
-                                  const double *diagonal, double norm, double noise)
 
 include "operations.pxi"
 include "coarse.pxi"

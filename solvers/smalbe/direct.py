@@ -27,7 +27,7 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector
 from mortarbench.solvers.common.conversion import check_positive, dense, needs_dense
-from mortarbench.solvers.smalbe.compiled import relative_residual
+from mortarbench.solvers.smalbe.compiled import relative_residuals
 from mortarbench.solvers.smalbe.driver import MAX_IDLE_TIGHTENINGS
 from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
@@ -119,7 +119,7 @@ class _Task:
             x, Px, z_box = faces.at(a)
         y = self.rows.multipliers(a)
         s = self.solution(x, y, z_box)
-        worst = relative_residual(qp, s, tol, Px, faces.diagonal, self.rows.G)
+        worst = max(relative_residuals(qp, s, tol, Px, faces.diagonal, self.rows.G)[:2])
         return _Point(x, y, z_box, worst)
 
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:

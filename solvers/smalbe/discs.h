@@ -260,6 +260,20 @@ static void advance_discs(const discs *D, double alpha, double *x, double *g,
         WITH_DIMENSION(D, advance_each, alpha, x, g, p, Hp, tau, NULL, NULL, result);
 }
 
+/* g = φ + β on discs. */
+static void project_gradient_on_discs(const discs *D, const double *x, double *g)
+{
+    for (Py_ssize_t i = 0; i < D->count; i++) {
+        double square = square_of_disc(D, 0, i, x);
+        if (is_inside(D, i, square))
+            continue;
+        int is_point = D->radius[i] == 0;
+        double inward = is_point ? 0 : held_share(D, 0, i, x, g, square);
+        FOR_VARIABLES(D, i, 0, j)
+            g[j] = is_point ? 0 : g[j] - inward * about_centre(D, x, j);
+    }
+}
+
 /* beta = β on discs. */
 static void chop_discs(const discs *D, const double *x, const double *g, double *beta)
 {
@@ -345,23 +359,4 @@ static void tangential_discs(const discs *D, const double *x, const double *g,
             w[j] = is_point ? 0 : w[j] - along * about_centre(D, x, j) - bend;
         }
     }
-}
-
-/* Return Σ (norm gᵢ)²/Dᵢᵢ with the projected gradient g on discs; see
-   `inward_energy`. */
-static double inward_energy_of_discs(const discs *D, const double *x, const double *g,
-                                     const double *diagonal, double norm, double noise)
-{
-    double total = 0;
-    for (Py_ssize_t i = 0; i < D->count; i++) {
-        double square = square_of_disc(D, 0, i, x);
-        double inward = is_inside(D, i, square) || D->radius[i] == 0
-                            ? 0 : held_share(D, 0, i, x, g, square);
-        FOR_VARIABLES(D, i, 0, j) {
-            double b = norm * (g[j] - inward * about_centre(D, x, j));
-            if (D->radius[i] > 0 && diagonal[j] > 0 && fabs(b) > noise)
-                total += b * b / diagonal[j];
-        }
-    }
-    return total;
 }

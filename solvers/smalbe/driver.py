@@ -83,6 +83,15 @@ class Carry(NamedTuple):
     block: FreeBlock | None
 
 
+class Residuals(NamedTuple):
+    """Relative KKT residuals of a point (`compiled.relative_residuals`)."""
+
+    gradient: float  #: larger of the errors of stationarity and of the gap
+    rows: float = 0.0
+    force: float = 0.0  #: scale of forces; 0 if unknown
+    energy: float = 0.0  #: scale of energies; 0 if unknown
+
+
 Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
 #: observer called after each step with its letter, x and g
 Note = Callable[[str, Vector, Vector], None]
@@ -244,9 +253,6 @@ def _projected(
         problem.factor = sparse.factor()
     else:
         problem = projected_problem(qp, find)
-    problem.tests_residuals = sparse is not None or (
-        options.expansion == "model" and not qp.b.size and problem.diagonal.size > 0
-    )
     return problem
 
 
@@ -339,8 +345,11 @@ class OuterLoop:
         """
         return Iterate(*self.solver.begin(x, mu, rho), mu, M, rho)
 
-    def solve(self, tol: float, at: Iterate) -> Iterate:
-        """Continue the outer loop from `at` to the tolerance `tol`."""
+    def solve(self, tol: float, at: Iterate, aim: float = 0.0) -> Iterate:
+        """Continue the outer loop from `at` to the tolerance `tol`.
+
+        aim : largest estimate of the relative KKT residual at the end; 0 for `tol`
+        """
         problem = self.problem
         nu, g, mu, M, rho, done, status = self.solver.solve(
             self.options,
@@ -348,14 +357,24 @@ class OuterLoop:
             at,
             partial(infeasible, problem.rows, problem.hull),
             self.watch,
+            aim,
         )
         outer = (*at.outer, *[OuterIteration(*one) for one in done])
         return Iterate(nu, g, mu, M, rho, outer, status)
 
+    def updated(self, at: Iterate) -> Iterate:
+        """Return the iterate after the update of the multipliers."""
+        mu, C = self.multipliers(at), self.problem.rows.C
+        return at._replace(mu=mu, g=at.g + C.T @ (mu - at.mu))
+
+    def multipliers(self, at: Iterate) -> Vector:
+        """Return the multipliers μ + ρCν (r,), with which the gradient at ν is g."""
+        return at.mu + at.rho * (self.problem.rows.C @ at.nu)
+
     def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
         """Return x, the multipliers a of Cx = Cx̃, z_box and Fx; takes one product."""
         box = qp.box
-        at = at._replace(nu=self.solver.onto_rows(at.nu))
+        at = at._replace(nu=self.solver.onto_rows(at.nu), mu=self.multipliers(at))
         point = self.solver.point(at.nu, at.mu, box.lower, box.upper)
         return point or recovered(self.problem, qp, at)
 
@@ -393,9 +412,9 @@ def _solve_to_tolerance(
     options, at = task.options, _start(task, tol)
     published = options.expansion not in ("model", "spectral")
     enough = PRESET_FACTOR * tol if published else tol
-    tighter, best, waited = 1.0, np.inf, 0
+    tighter, aim, best, waited = 1.0, 0.0, np.inf, 0
     while True:
-        at = task.loop.solve(tighter * tol, at)
+        at = task.loop.solve(tighter * tol, at, aim)
         if at.status is Status.INFEASIBLE:
             message = "no point within the bounds satisfies the equality rows"
             return Solution.without_point(task.qp, at.status, message), _nothing
@@ -403,18 +422,21 @@ def _solve_to_tolerance(
             message = "the iterates diverged"
             return Solution.without_point(task.qp, at.status, message), _nothing
         point, Fx = _point(task, at)
-        worst = _residual(task, point, Fx, tol)
+        residuals = _residuals(task, point, Fx, tol)
+        worst = max(residuals.gradient, residuals.rows)
         if worst <= enough:
             return _counted(task, point), partial(_carry, task, at)
-        waited = 0 if worst < best / 2 else waited + 1
+        waited = 0 if worst < 0.9 * best else waited + 1
         best = min(best, worst)
         if at.status is not Status.SOLVED or waited == MAX_IDLE_TIGHTENINGS:
             break
-        # Tighten by 0.01 if the last tightening had little effect: multipliers may
-        # converge so slowly that a single outer iteration already meets a slightly
-        # smaller tolerance.
-        tighter *= 0.01 if waited else min(0.5, max(0.01, enough / worst))
-        at = _with_exact_gradient(task, at, _penalty(task.rho, tighter * tol))
+        is_off_rows = residuals.rows > enough or waited > 0
+        if is_off_rows:
+            # by 0.01 if the last tightening had little effect: multipliers may converge
+            # so slowly that one outer iteration already meets a slightly smaller tolerance
+            tighter *= 0.01 if waited else min(0.5, max(0.01, enough / residuals.rows))
+            at = task.loop.updated(at)
+        at, aim = _tightened(task, at, residuals, enough)
     message = f"stagnated at residual {worst:.1e}: rounding, or the cost is unbounded"
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
@@ -422,11 +444,23 @@ def _solve_to_tolerance(
     return _counted(task, point), _nothing
 
 
-def _with_exact_gradient(task: _Task, at: Iterate, rho: float) -> Iterate:
-    """Return the iterate with a recomputed gradient, without errors of its updates."""
-    x = task.problem.rows.x_tilde + at.nu
-    fresh = task.loop.first(x, at.mu, M=at.M, rho=min(at.rho, rho))
-    return fresh._replace(outer=at.outer)
+def _tightened(
+    task: _Task, at: Iterate, residuals: Residuals, enough: float
+) -> tuple[Iterate, float]:
+    """Return where the inner run continues after a failed test, and its next aim.
+
+    CG is not restarted. If the residual is much larger than its estimate, the gradient contains errors of its
+    updates and is recomputed.
+
+    enough : largest permitted residual
+    """
+    gradient, _, force, energy = residuals
+    estimate = task.loop.solver.estimate(at, force, energy)
+    if gradient > 2 * estimate:
+        x = task.problem.rows.x_tilde + at.nu
+        at = at._replace(g=task.loop.first(x, at.mu, M=at.M, rho=at.rho).g)
+        estimate = task.loop.solver.estimate(at, force, energy)
+    return at, 0.95 * estimate * min(1.0, enough / max(gradient, 1e-300))
 
 
 def _nothing() -> None:
@@ -444,7 +478,7 @@ def _carry(task: _Task, at: Iterate) -> Carry:
     return Carry(
         x=x / root,
         side=side,
-        force=problem.spectrum.norm * (problem.rows.C.T @ at.mu) * root,
+        force=problem.spectrum.norm * (problem.rows.C.T @ task.loop.multipliers(at)) * root,
         spectrum=problem.spectrum,
         block=eliminated and eliminated.block,
     )
@@ -535,18 +569,18 @@ def _normal_part(x: Vector, v: Vector) -> Vector:
     return normal
 
 
-def _residual(task: _Task, point: Solution, Fx: Vector, tol: float) -> float:
-    """Return the relative KKT residual of the original QP."""
+def _residuals(task: _Task, point: Solution, Fx: Vector, tol: float) -> Residuals:
+    """Return the relative KKT residuals of the original QP."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if task.problem.discs:
         task.problem.F.count += 1
-        return relative_residual(qp, point, tol)
+        return Residuals(relative_residual(qp, point, tol))
     if isinstance(task.scaled, ScaledSparse):
         diagonal = task.scaled.diagonal
     if task.eliminated is not None:
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
-    return compiled.relative_residual(qp, point, tol, Fx, diagonal, G)
+    return Residuals(*compiled.relative_residuals(qp, point, tol, Fx, diagonal, G))
 
 
 def _counted(task: _Task, point: Solution) -> Solution:

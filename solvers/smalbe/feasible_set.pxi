@@ -241,6 +241,20 @@ cdef class FeasibleSet:
         if self.D.count:
             chop_discs(&self.D, x, g, beta)
 
+    cdef void project_gradient(
+        self, const double *x, const double *g, double *gP
+    ) noexcept:
+        """gP ← φ + β."""
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            gP[i] = g[i]
+            if x[i] <= self.lower[i] and g[i] > 0:
+                gP[i] = 0.0
+            if x[i] >= self.upper[i] and g[i] < 0:
+                gP[i] = 0.0
+        if self.D.count:
+            project_gradient_on_discs(&self.D, x, gP)
+
     cdef bint marks(self, const double *x, double *free) noexcept:
         """free ← 1 off the boundary, else 0; return True if any entry changed."""
         cdef Py_ssize_t i, j, first, last
@@ -362,23 +376,3 @@ cdef class FeasibleSet:
         s is zero for components that the set fixes, unless `release` is true.
         """
         return within(z, x, g, self.lower, self.upper, release, s, self.n)
-
-    cdef double inward_energy(self, const double *x, const double *g,
-                              const double *diagonal, double norm,
-                              double noise) noexcept:
-        """Return Σ (norm·gᵢ)²/Dᵢ over components whose descent direction is feasible.
-
-        noise : components with |norm·gᵢ| ≤ noise are omitted
-        """
-        cdef double energy = 0.0
-        cdef Py_ssize_t i, o, size
-        if self.has_discs:
-            for i in range(self.D.ranges):
-                o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
-                energy += inward_energy(x + o, g + o, self.lower + o, self.upper + o,
-                                        diagonal + o, norm, noise, size)
-            energy += inward_energy_of_discs(&self.D, x, g, diagonal, norm, noise)
-            return energy
-        return inward_energy(
-            x, g, self.lower, self.upper, diagonal, norm, noise, self.n
-        )

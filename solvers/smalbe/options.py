@@ -64,7 +64,6 @@ class Options:
     lanczos_steps: int = 12  #: limit of Lanczos steps; at most n/6 or n/10, at least 5
     # only with the preconditioners model and none; others require the original P
     eliminate: Eliminate = "sequences"  #: when to eliminate free variables
-    energy: float = 50.0  #: largest energy error estimate relative to tol; 0: no limit
     history: bool = False  #: True to record each step
     max_steps: int = 200_000  #: limit of MPRGP steps plus outer iterations
 
@@ -79,9 +78,8 @@ class Options:
         )
         if not 0 < self.beta < 1:
             raise ValueError(f"beta = {self.beta}; expected a number between 0 and 1")
-        for name, value in (("rho", self.rho), ("energy", self.energy)):
-            if not 0 <= value < np.inf:
-                raise ValueError(f"{name} = {value}; expected 0, or a positive number")
+        if not 0 <= self.rho < np.inf:
+            raise ValueError(f"rho = {self.rho}; expected 0, or a positive number")
         if not self.rho_growth >= 1:
             raise ValueError(f"rho_growth = {self.rho_growth}; expected at least 1")
         if not self.alpha <= 2:

@@ -7,11 +7,6 @@
 # (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`). With 1e3,
 # `test_a_stalled_multiplier_increases_the_penalty` fails.
 cdef double MAX_RHO = 1e10
-# Limit of the total number of products, relative to the number of products at which the
-# gradient is small enough. The reduction of the energy error may therefore take a
-# quarter more products
-# (`test_an_energy_error_that_is_too_large_costs_some_more_products`).
-cdef double ENERGY_BUDGET = 1.25
 # Smallest τ of a model, relative to the norm. Steps are therefore at most 1e4 times as
 # long as the steps of ordinary gradient projection. With zero, an F of low rank leads
 # to τ = 0, so that no step is possible (`test_earlier_failures_do_not_recur`).
@@ -56,12 +51,15 @@ cdef class SMALBE(MPRGP):
     cdef const double *diagonal  # NULL for an operator without a diagonal
     cdef Model cached_model
     cdef double cached_rho
-    cdef double M_now, tol, energy, small_gradient, coarse_gradient
-    # (3n,) D⁻¹ᐟ² and workspace of the test of KKT residuals; None to test ‖g^P‖
+    cdef double M_now, tol, small_gradient, coarse_gradient
+    # (5n,) D⁻¹ᐟ² and workspace of the stopping test
     cdef Room tested
+    cdef double force, energy  # lower bounds of the scales of `residual`
+    cdef double aim  # largest accepted result of `residual`
+    cdef double least_gradient, entry_gradient
+    cdef bint solved  # True if `is_solved` ended the last inner run
+    cdef double *scaled_q  # q/‖𝒫F𝒫‖
     cdef double next_tested  # ‖g^P‖ at or below which KKT residuals are evaluated next
-    # number of products up to which the energy error is reduced
-    cdef long most_products
 
     def __init__(self, problem, options, bint preconditioned, M=None, step_rule=None):
         cdef const double *lower
@@ -97,11 +95,13 @@ cdef class SMALBE(MPRGP):
         self.spectral_length = 0.0
         self.preconditioned = preconditioned
         self.factor, self.tail = problem.factor, 1.0
-        if problem.tests_residuals:
-            self.tested = Room(3 * self.n)
+        self.tested = Room(5 * self.n)
+        self.scaled_q = self.tested.at + 4 * self.n
+        copy_scaled(self.inverse_norm, self.q, self.scaled_q, self.n)
+        if len(problem.diagonal):
             memcpy(self.tested.at, self.diagonal, self.n * sizeof(double))
             scale(self.inverse_norm, self.tested.at, self.n)
-            scales(self.tested.at, self.n)
+        scales(self.tested.at, self.n)
         kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
         if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
@@ -265,7 +265,9 @@ cdef class SMALBE(MPRGP):
 
     # the algorithm
 
-    def solve(self, options, double tol, at, infeasible, watch=None):
+    def solve(
+        self, options, double tol, at, infeasible, watch=None, double aim=0.0
+    ):
         """Continue the outer loop from the iterate `at`.
 
         For k = 0, 1, …:
@@ -276,13 +278,7 @@ cdef class SMALBE(MPRGP):
         3. μ ← μ + ρCν. The gradient changes by ρQν, without a product. H is unchanged,
            so the directions of CG remain conjugate on an unchanged face.
 
-        until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, for the original rows, ‖Gν‖ ≤ tol‖e‖.
-        (If b = 0, the initial gradient replaces b; if e = 0, ν replaces x̃.) In
-        addition, the error in the energy norm is estimated (`energy_error`), because
-        the displacements of supports may dominate ‖b‖, while contact forces contribute
-        little. The reduction of this error may take at most a quarter more products: if
-        stiffnesses differ widely, rounding can keep the estimate permanently above its
-        limit.
+        until the relative KKT residual of the QP is at most tol (`is_solved`).
 
         4. Apply safeguards. If two consecutive outer iterations did not halve ‖Cν‖,
            then ρ ← 10ρ, but at most MAX_RHO. If ‖Cν‖ is small enough, but the gradient
@@ -298,6 +294,7 @@ cdef class SMALBE(MPRGP):
         watch : function of k and the right-hand side that returns an observer of outer
             iteration k, or None; the observer is called after each step with its
             letter, x and g
+        aim : largest estimate of the relative KKT residual that ends the loop; 0 for tol
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef double before = -INFINITY, lagrangian, error, growth = options.rho_growth
@@ -307,8 +304,7 @@ cdef class SMALBE(MPRGP):
         memcpy(self.g, address(at.g), n * sizeof(double))
         if at.rho != self.rho or not at.outer:
             self.directions.begin(self.free)
-        self.rho, self.M_now, self.tol, self.energy = at.rho, at.M, tol, options.energy
-        self.most_products, self.knows_Cx = 0, False
+        self.rho, self.M_now, self.tol, self.knows_Cx = at.rho, at.M, tol, False
         multipliers = copied(address(at.mu), r)
         cdef double *mu = address(multipliers)
         self.b_size = sqrt(dot(self.b, self.b, n))
@@ -317,6 +313,11 @@ cdef class SMALBE(MPRGP):
         self.small_gradient = tol * self.b_size
         self.coarse_gradient = options.eta * self.b_size
         self.next_tested = FIRST_TESTED * self.small_gradient
+        self.aim, self.least_gradient = aim or tol, self.small_gradient
+        if aim:
+            self.least_gradient = LEAST_TESTED * self.entry_gradient
+        elif not self.rows.exist and self.diagonal:
+            self.least_gradient *= LEAST_TESTED
         done, errors = [], [o.infeasibility for o in at.outer[-2:]]
         for o in at.outer:
             left -= len(o.trace) + 1
@@ -330,8 +331,7 @@ cdef class SMALBE(MPRGP):
             note = watch and watch(len(at.outer) + len(done), copied(self.rhs, n))
             stopped = self.minimise(max(left, 0), trace, note)
             left -= len(trace) + 1
-            solved = sqrt(self.parts.phi_square + self.parts.beta_square) <= self.small_gradient
-            solved = stopped if self.tested is not None else solved and self.is_accurate()
+            solved = stopped and self.solved
             # 2. The Lagrangian, and the precision of the inner problems.
             self.rows.times(self.x, self.Cv)
             error = self.rows.size(self.Cv)
@@ -339,18 +339,10 @@ cdef class SMALBE(MPRGP):
             enough = lagrangian >= before + self.rho / 2 * error * error
             before = lagrangian
             done.append((trace.decode(), M, self.rho, error, lagrangian))
-            # 3. The multipliers.
-            self.rows.add(self.rho, self.Cv, self.g)
-            for i in range(r):
-                mu[i] += self.rho * self.Cv[i]
-            if not enough:
-                self.M_now *= options.beta
-                if growth != 1:
-                    self.change_penalty(growth * self.rho)
+            # 3. Stop, or apply the safeguards that may end the loop.
             if solved:
                 status = Status.SOLVED
                 break
-            # 4. Safeguards.
             errors = [*errors, error][len(errors) > 2:]
             stalled = len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
             if (not stopped or stalled) and infeasible(copied(self.x, n)):
@@ -358,6 +350,14 @@ cdef class SMALBE(MPRGP):
                 break
             if not stopped or left < 0:
                 break
+            # 4. The multipliers, the precision of the next inner run, and the penalty.
+            self.rows.add(self.rho, self.Cv, self.g)
+            for i in range(r):
+                mu[i] += self.rho * self.Cv[i]
+            if not enough:
+                self.M_now *= options.beta
+                if growth != 1:
+                    self.change_penalty(growth * self.rho)
             if stalled and self.rows.are_met(self.x, self.Cv, tol, self.b_size):
                 self.M_now /= 10
             elif stalled:
@@ -375,89 +375,67 @@ cdef class SMALBE(MPRGP):
     cdef bint stops(self) except -1:
         """Return True if the inner run may end."""
         cdef double size = sqrt(self.parts.phi_square + self.parts.beta_square)
-        if self.tested is not None:
-            return self.is_tested_solved(size)
-        if self.rows.exist and size < self.coarse_gradient:
-            if size < self.M_now * self.violation():
-                return True
-        return size <= self.small_gradient and self.is_accurate()
+        self.solved = size <= self.next_tested and self.is_solved(size)
+        if self.solved or not self.rows.exist or size >= self.coarse_gradient:
+            return self.solved
+        return size < self.M_now * self.violation()
 
-    cdef bint is_tested_solved(self, double size) except -1:
+    cdef bint is_solved(self, double size) except -1:
         """Return True if the relative KKT residual is within tol.
 
         The evaluation costs as much as several steps. It is therefore repeated only
         when ‖g^P‖ (the argument `size`) has decreased enough, on the assumption that
         the residual is proportional to ‖g^P‖.
         """
-        cdef double residual
-        if size > self.next_tested:
-            return False
-        residual = self.residual()
-        if residual <= self.tol or size <= LEAST_TESTED * self.small_gradient:
-            return self.is_accurate()
-        self.next_tested = size * fmin(fmax(2 * self.tol / residual, 0.03), 0.9)
+        cdef double residual = self.residual()
+        if residual <= self.aim or size <= self.least_gradient:
+            self.rows.times(self.x, self.Cv)
+            return self.rows.are_met(self.x, self.Cv, self.tol, self.b_size)
+        self.next_tested = fmax(
+            size * fmin(fmax(2 * self.aim / residual, 0.03), 1.0), self.least_gradient
+        )
         return False
 
     cdef double residual(self) noexcept:
-        """Return the relative KKT residual of a problem with bounds only (stopping.pxi).
+        """Return the relative KKT residual, apart from the rows (stopping.pxi).
 
-        Since multipliers of bounds remove the other components of the gradient, r = g^P
-        and the gap is xᵀg^P.
+        The multipliers of bounds, discs and rows remove all other components of the
+        gradient of the QP. Therefore r = ‖𝒫F𝒫‖g^P and the gap is xᵀr. With rows, the
+        component of Px along them is unknown. Until the scales are known, they then
+        consist of q alone, and the result is an upper bound.
         """
         cdef Py_ssize_t i, n = self.n
         cdef double *w = self.tested.at
         cdef double *r = w + n
-        cdef double *Hx = r + n
+        cdef double *Px = r + n
+        cdef double *x = Px + n
         cdef double[3] sums
         cdef double[3] most
+        cdef double[2] scales
         cdef double gap = 0.0
+        scales[:] = [self.force, self.energy]
         sums[:] = [0.0, 0.0, 0.0]
         most[:] = [0.0, 0.0, 0.0]
+        self.set.project_gradient(self.x, self.g, r)
         for i in range(n):
-            Hx[i] = self.g[i] + self.b[i]
-            r[i] = self.g[i]
-            if self.x[i] <= self.set.lower[i] and r[i] > 0:
-                r[i] = 0.0
-            if self.x[i] >= self.set.upper[i] and r[i] < 0:
-                r[i] = 0.0
-            gap += self.x[i] * r[i]
-        terms_of_test(self.x, Hx, self.b, r, w, n, sums, most)
-        return worst_ratio(sums, most, gap, self.tol)
+            x[i] = self.rows.x_tilde[i] + self.x[i]
+            Px[i] = 0.0 if self.rows.exist else self.g[i] + self.b[i]
+            gap += x[i] * r[i]
+        terms_of_test(x, Px, self.scaled_q, r, w, n, sums, most)
+        return worst_ratio(sums, most, gap, self.tol, scales)
 
-    cdef bint is_accurate(self) except -1:
-        """Return True if the rows are satisfied and the energy error is acceptable.
+    def estimate(self, at, double force, double energy):
+        """Return the estimate of the residual at an iterate.
 
-        The energy error is accepted if it is small or if its budget of products is used
-        up.
+        force, energy : scales at this iterate, used from now on
         """
-        self.rows.times(self.x, self.Cv)
-        if not self.rows.are_met(self.x, self.Cv, self.tol, self.b_size):
-            return False
-        if not self.most_products:
-            self.most_products = <long> (ENERGY_BUDGET * self.F.count)
-        if not self.energy or self.F.count >= self.most_products:
-            return True
-        return self.energy_error() <= self.energy * self.tol
-
-    cdef double energy_error(self) noexcept:
-        """Estimate the relative energy error from the remaining gradient.
-
-        With the gradient r on the free components f, ‖x − x*‖_F² = rᵀF_ff⁻¹r, and each
-        rᵢ²/F_ii is a lower bound on this number. On contact problems, the certified
-        error was 0.8 to 8.4 times the square root of the sum of these bounds.
-        Components of the gradient within the rounding of q are omitted. The estimate is
-        zero for an operator F without a known diagonal.
-        """
-        cdef double energy = 0.0, most = 0.0, error
-        cdef Py_ssize_t i
-        if not self.diagonal:
-            return 0.0
-        for i in range(self.n):
-            energy += self.q[i] * (self.rows.x_tilde[i] + self.x[i])
-            most = fabs(self.q[i]) if fabs(self.q[i]) > most else most
-        error = self.set.inward_energy(self.x, self.g, self.diagonal, self.norm,
-                                       1e3 * 2.0 ** -52 * most)
-        return sqrt(error / fabs(energy)) if energy else 0.0
+        memcpy(self.x, address(at.nu), self.n * sizeof(double))
+        memcpy(self.g, address(at.g), self.n * sizeof(double))
+        self.force = force / sqrt(self.norm)
+        self.energy = energy / self.norm
+        residual = self.residual()
+        self.entry_gradient = sqrt(dot(self.tested.at + self.n, self.tested.at + self.n, self.n))
+        return residual
 
     cdef double lagrangian(self, const double *mu) noexcept:
         """Return L(ν, μ), computed from the gradient; `Cv` must contain Cν."""

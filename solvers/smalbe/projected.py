@@ -62,7 +62,6 @@ class Projected:
     preconditioner: Preconditioner | None = None
     #: incomplete factor of the free block of a sparse F in scaled variables, or None
     factor: compiled.IncompleteFactor | None = None
-    tests_residuals: bool = False  #: True to stop by KKT residuals instead of ‖g^P‖
     discs: tuple[Discs, ...] = ()  #: discs of x, not of ν
     semidefinite: bool = False  #: True if F has a kernel, see `is_semidefinite`
 

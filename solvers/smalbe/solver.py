@@ -40,10 +40,7 @@ class SMALBE(Options):
     forces in three dimensions. With discs and a dense P, variables without constraints
     are first eliminated by a Cholesky factor.
 
-    `tol` bounds ‖g^P‖/‖b‖, where g^P is the projected gradient of the projected
-    problem, and ‖Gx − e‖/‖e‖. For QPs with bounds only and a known diagonal of P, the
-    default options test the relative KKT residual instead. The solver claims a solution
-    only if the relative KKT residual of the original QP is also at most tol.
+    The solver stops when the relative KKT residual of the QP is at most tol.
     """
 
     about: ClassVar[About] = About(

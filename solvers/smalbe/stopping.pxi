@@ -10,9 +10,11 @@ cdef double ratio(double error, double size, double rounding=0.0) noexcept:
 
 
 cdef double worst_ratio(
-    const double *sums, double *most, double gap, double tol
+    const double *sums, double *most, double gap, double tol, double *scales
 ) noexcept:
     """Return the larger of the relative errors of stationarity and of the gap.
+
+    scales : lower bounds of the scales of forces and energies; receives the scales
 
     sums, most : results of `terms_of_test`; on return, most[2] is the size of all
         scaled variables
@@ -23,6 +25,8 @@ cdef double worst_ratio(
         force = size if tol > 0 else 1.0
     energy = fmax(fmax(fabs(sums[0]), fabs(sums[1])), tol * force * force)
     energy = energy if energy else force * size
+    scales[0] = force = fmax(force, scales[0])
+    scales[1] = energy = fmax(energy, scales[1])
     most[2] = fmax(size, tol * force)
     return fmax(
         ratio(most[0], force, fmin(rounding * size, tol * force)),
@@ -45,8 +49,11 @@ cdef bint scales(double *d, Py_ssize_t n) noexcept:
     return total[1] > 0
 
 
-def relative_residual(qp, s, double tol, Px, diagonal, G):
-    """Return the largest error of a point within its bounds; inf if it is not finite.
+def relative_residuals(qp, s, double tol, Px, diagonal, G):
+    """Return the errors of a point within its bounds; inf if one is not finite.
+
+    The first is the larger of the errors of stationarity and of the gap, the second the
+    largest error of the rows. The scales of forces and energies follow.
 
     s : a `Solution` without multipliers of inequality rows
     tol : see `solvers.common.stopping.relative_residual`
@@ -58,7 +65,8 @@ def relative_residual(qp, s, double tol, Px, diagonal, G):
     cdef list owners = []
     cdef double[4] sums
     cdef double[3] most
-    cdef double worst, least
+    cdef double[2] sizes
+    cdef double worst = 0.0, gradient, least
     cdef Room room = Room(2 * n + 3 * m)
     cdef double *w = room.at
     cdef double *r = w + n
@@ -101,6 +109,7 @@ def relative_residual(qp, s, double tol, Px, diagonal, G):
     # 2. Stationarity and the gap
     sums[:] = [0.0, 0.0, 0.0, 0.0]
     most[:] = [0.0, 0.0, 0.0]
+    sizes[:] = [0.0, 0.0]
     for i in range(n):
         r[i] += Fx[i] + q[i] + z[i]
         if z[i] != 0:
@@ -108,9 +117,9 @@ def relative_residual(qp, s, double tol, Px, diagonal, G):
     terms_of_test(x, Fx, q, r, w, n, sums, most)
     for i in range(m):
         sums[3] += e[i] * y[i]
-    worst = worst_ratio(sums, most, sums[0] + sums[1] + sums[3], tol)
+    gradient = worst_ratio(sums, most, sums[0] + sums[1] + sums[3], tol, sizes)
     # 3. The rows
     for i in range(m):
         least = (1e-3 if e[i] else 0.1) * most[2] * size[i]
         worst = fmax(worst, ratio(missed[i] - e[i], fabs(e[i]) + fmax(terms[i], least)))
-    return worst
+    return gradient, worst, sizes[0], sizes[1]

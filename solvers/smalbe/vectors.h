@@ -1020,21 +1020,6 @@ TWICE static void masked(in free, in a, out t, Py_ssize_t n)
         t[i] = free[i] * a[i];
 }
 
-/* Return Σ (‖𝒫F𝒫‖ gᵢ)²/Fᵢᵢ over the components whose gradient exceeds `noise` and
-   for which the direction of descent is feasible. */
-TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, double norm,
-                                  double noise, Py_ssize_t n)
-{
-    double total = 0;
-    for (Py_ssize_t i = 0; i < n; i++) {
-        double r = norm * g[i], d = diagonal[i] > 0 ? diagonal[i] : 1;
-        int inward = ((g[i] < 0) & (x[i] < upper[i])) | ((g[i] > 0) & (x[i] > lower[i]));
-        int result = (diagonal[i] > 0) & (fabs(r) > noise) & inward;
-        total += result ? r * r / d : 0;
-    }
-    return total;
-}
-
 /* Add terms of the stopping test (`solvers/common/stopping.py`) at a point with the
    residual r, where w = D⁻¹ᐟ²: xᵀPx, qᵀx and Σ(xᵢ/wᵢ)² to `sums`; `most` becomes at least
    as large as the components of w|r|, w max(|Px|, |q|) and |x|/w. */

@@ -73,7 +73,7 @@ def run_compiled(
     options = SimpleNamespace(
         Gamma=rules.Gamma, expansion=rules.expansion, reduced=rules.reduced,
         proportioning=rules.proportioning, alpha=rules.relaxation,
-        recycle=rules.kept > 0, max_steps=max_steps, energy=0.0, eta=0.1, beta=0.5,
+        recycle=rules.kept > 0, max_steps=max_steps, eta=0.1, beta=0.5,
         rho_growth=1.0,
     )  # fmt: skip
     solver = SMALBE(

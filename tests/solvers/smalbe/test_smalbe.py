@@ -51,7 +51,7 @@ def outer_loop():
     def run(problem, *, M=1.0, eta=0.1, rho=3.0, growth=1.0, tol=1e-8):
         options = SMALBE(
             expansion="mixed", proportioning="cg", preconditioner="none", M=M,
-            beta=0.5, eta=eta, rho_growth=growth, max_steps=20_000, energy=0.0,
+            beta=0.5, eta=eta, rho_growth=growth, max_steps=20_000,
             recycle=False,
         )  # fmt: skip
         chosen = driver.outer_loop(problem, None, options)
