@@ -52,5 +52,5 @@ def test_smalbe_needs_fewer_products_than_permon_on_the_benchmark():
     assert len(rows) == 10
     for row in rows:
         permon, smalbe = (int(row[2]), int(row[5])), (int(row[3]), int(row[6]))
-        assert smalbe[0] <= 0.61 * permon[0]
-        assert smalbe[1] <= 0.61 * permon[1]
+        assert smalbe[0] <= 0.52 * permon[0]
+        assert smalbe[1] <= 0.52 * permon[1]

@@ -94,15 +94,12 @@ def test_a_continued_run_has_the_remaining_step_limit(outer_loop):
 
 @pytest.mark.parametrize("most", [1, 5, 20])
 def test_the_lagrangian_is_that_of_the_point(outer_loop, most):
-    """L = ½νᵀHν − bᵀν + μᵀCν, with the multipliers of the inner run before
-    their update.
-    """
+    """L = ½νᵀHν − bᵀν + μᵀCν; the last inner run is not followed by an update of μ."""
     problem = problem_of(drawn(314159))
     at = outer_loop(problem, np.zeros(60), tol=1e-8, max_steps=most)
     Cnu, rho = problem.rows.C @ at.nu, at.outer[-1].rho
-    mu = at.mu - rho * Cnu
     A_nu = times_projected(problem.F, problem.rows, at.nu) / problem.spectrum.norm
-    L = 0.5 * (at.nu @ A_nu + rho * Cnu @ Cnu) - problem.b @ at.nu + mu @ Cnu
+    L = 0.5 * (at.nu @ A_nu + rho * Cnu @ Cnu) - problem.b @ at.nu + at.mu @ Cnu
 
     assert at.outer[-1].lagrangian == pytest.approx(L, rel=1e-10)
 
