@@ -10,6 +10,7 @@ import markdown
 import pytest
 import yaml
 
+import mortarbench
 from mortarbench.harness.record import Record
 from tests.support import ROOT
 
@@ -140,3 +141,11 @@ def test_the_page_of_records_has_a_row_with_a_range_for_each_field():
     assert [row[0].strip(" `") for row in rows] == [*Record.__struct_fields__]
     assert all(row[3].strip() for row in rows)
     assert "| `tol` | number | > 0, ≤ 1 | tolerance passed to the solver |" in text
+
+
+def test_the_page_of_python_names_describes_every_public_name():
+    text = pages.python_page()
+    names = re.findall(r"^::: mortarbench\.(?:listing\.)?(\w+)$", text, re.M)
+
+    assert sorted(names) == sorted(mortarbench.__all__)
+    assert "::: mortarbench.harness.needs_matrices\n" in text
