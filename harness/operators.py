@@ -55,15 +55,6 @@ class Preconditioned(Protocol):
         """
 
 
-@runtime_checkable
-class Compiled(Protocol):
-    """A product x ↦ Px that compiled solvers can apply without calling Python."""
-
-    @property
-    def linear_map(self) -> LinearMap:
-        """The map x ↦ Px as an object of compiled code."""
-
-
 class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has no types
     """A symmetric operator x ↦ Px on vectors of `n` components.
 

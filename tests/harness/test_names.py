@@ -181,8 +181,3 @@ def test_the_error_for_a_path_names_the_case_of_the_file(
         parse(text, families)
     head = text.partition("/")[0]
     assert str(e.value) == f"unknown family {head!r}; did you mean {named!r}, a file?"
-
-
-@pytest.mark.parametrize("text", ["meshed:a/b.toml", "meshed:a/b.toml/qp"])
-def test_a_file_with_a_single_form_needs_no_form(text):
-    assert str(parse(text, {"meshed": Meshed()})) == "meshed:a/b.toml/qp"

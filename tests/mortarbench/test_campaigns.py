@@ -237,18 +237,6 @@ def test_two_sessions_on_one_machine_are_kept_and_pooled(measure, campaign, tmp_
     assert [*answers[answers.case == "well/dual"].repeats] == [4, 4]
 
 
-def test_a_measurement_of_two_sessions_is_replayed_by_session_and_run_id(
-    measure, tmp_path
-):
-    a, b = (measure(name, depths="1").records for name in "ab")
-    mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
-
-    again = mb.replay(tmp_path / "all", b[0].identity, plugins=[TOY_PROBLEM])
-    assert again.then == b[0]
-    with pytest.raises(mb.InputError, match=f"2 measurements .*{a[0].identity}"):
-        mb.replay(tmp_path / "all", a[0].run_id, plugins=[TOY_PROBLEM])
-
-
 @pytest.mark.parametrize(
     ("damage", "said"),
     [

@@ -1,6 +1,5 @@
 """Output, output streams and exit codes of the command line."""
 
-import io
 import json
 import os
 import signal
@@ -30,11 +29,6 @@ FAMILIES = load_plugin(TOY_PROBLEM).problems
 def report(folder, formats, *, factor=10.0):
     name = "index" if factor == 10 else f"index-{factor:g}"
     return [folder / f"{name}.{f}" for f in formats]
-
-
-def paper(registries, out, quick, say):
-    say("Figure 1")
-    return [out / f"index-{quick}.html", out / "figure1.pdf"]
 
 
 @pytest.fixture
@@ -190,28 +184,6 @@ def test_an_exported_qp_is_the_emitted_qp_with_the_name_of_its_case(cli, tmp_pat
     assert qp.q.tolist() == [-4, -4]
     assert meta["name"] == "well/n=2/depth=4/dual"
     assert (meta["scale"], meta["constant"]) == (2.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("formats", "printed"),
-    [("md,html,csv", "index.html"), ("csv,md", "index.md"), ("csv,tex", "")],
-)
-def test_report_prints_the_main_path_only(cli, tmp_path, formats, printed):
-    """The path of the page is printed; without a page, the folder of the report."""
-    (tmp_path / "folder").mkdir()
-    code, out, err = cli("report", "folder", "--format", formats)
-
-    assert (code, err) == (0, "")
-    assert Path(out.strip()) == Path("folder") / printed
-    assert len(out.splitlines()) == 1
-
-
-@pytest.mark.parametrize("factor", ["0", "-1", "nan", "inf"])
-def test_a_factor_that_is_not_positive_is_refused(cli, factor):
-    code, out, err = cli("report", "folder", "--factor", factor)
-
-    assert (code, out) == (2, "")
-    assert f"--factor = {float(factor)}; expected a positive number" in err
 
 
 def test_doctor_prints_the_same_as_json(cli):
@@ -479,17 +451,6 @@ PROBLEMS = {{"deeper": well, "nothing": Nothing()}}
 """
 
 
-def test_paper_prints_its_progress_and_the_path_of_the_page(cli, monkeypatch):
-    monkeypatch.setattr("mortarbench.cli.paper.measure_and_write", paper)
-
-    assert cli("paper") == (
-        0,
-        "out/paper/index-False.html\n",
-        "mortarbench: Figure 1\n",
-    )
-    assert cli("paper", "--quick", "--out", "a")[1] == "a/index-True.html\n"
-
-
 def test_help_exits_with_0(cli, capsys):
     with pytest.raises(SystemExit) as e:
         cli("run", "--help")
@@ -631,20 +592,6 @@ def test_a_run_continues_if_its_output_is_closed():
         os.dup2(
             os.open(os.devnull, os.O_WRONLY), writing
         )  # so that closing it succeeds
-
-
-def test_on_a_terminal_a_run_shows_a_bar_with_its_activity(monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True
-
-    with display_on(terminal) as progress:
-        progress.start(7)
-        progress.say("osqp on [red]/primal")
-        progress.advance(None)
-
-    assert "1/7" in terminal.getvalue()
-    assert "osqp on [red]/primal" in terminal.getvalue()
 
 
 def test_a_complete_quiet_run_prints_nothing(cli):

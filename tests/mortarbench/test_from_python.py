@@ -12,7 +12,6 @@ import pytest
 import qpsolvers
 
 import mortarbench as mb
-from mortarbench.registries import Registries
 from tests.support.active_row import QP, ActiveRow, Hangs
 
 pytestmark = pytest.mark.together
@@ -44,24 +43,6 @@ def test_problems_of_qpsolvers_and_cvxpy_are_solved_like_a_qp():
         assert answer.verdict is mb.Verdict.VERIFIED
         assert answer.record.objective == pytest.approx(-1)
     assert mb.verify(qpsolvers.Problem(**parts), [1, 0]).verdict is mb.Verdict.VERIFIED
-
-
-def test_a_written_answer_contains_the_point_and_the_displacements(tmp_path):
-    """The displacement of the loaded corner is the quantity `tip`."""
-    answer = mb.solve(SMALL, "smalbe")
-    with np.load(answer.save(tmp_path / "a.npz")) as stored:
-        arrays = dict(stored)
-    tip = arrays["points"].sum(axis=1).argmax()  # upper right corner
-
-    for name in ("x", "y", "z", "z_box"):
-        np.testing.assert_array_equal(arrays[name], getattr(answer.solution, name))
-    np.testing.assert_allclose(
-        arrays["displacements"][tip], answer.quantities["tip"], rtol=1e-12
-    )
-    mb.solve(QP, "clarabel").save(tmp_path / "b.npz")
-    with np.load(tmp_path / "b.npz") as stored:
-        assert sorted(stored) == ["x", "y", "z", "z_box"]
-        assert stored["x"] == pytest.approx([0.5, 0.5], abs=1e-7)
 
 
 def test_an_answer_without_a_point_is_not_written(tmp_path):
@@ -486,12 +467,3 @@ def test_an_argument_of_the_wrong_type_is_refused_with_the_expected_type(call, m
     with pytest.raises(mb.InputError, match=message) as e:
         call()
     assert "\n" not in str(e.value)
-
-
-def test_a_qp_needs_no_plug_in_and_no_registry_to_be_a_case():
-    case = mb.solve(QP, "clarabel").case
-
-    assert repr(case) == (
-        "<Case qp: 2 variables, 0 equalities, 1 inequalities, 0 bounds>"
-    )
-    assert isinstance(case.registries, Registries)

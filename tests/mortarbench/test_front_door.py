@@ -50,17 +50,6 @@ def test_every_promised_name_is_exported():
         mb.solv  # noqa: B018
 
 
-def test_a_case_has_its_canonical_name_and_sizes():
-    case = mb.build("beam-ring/Nh=3/Nr=4/radial=6/steps=1/step=1/primal")
-
-    assert case.name == "beam-ring/Nr=4/Nh=3/steps=1/primal"
-    assert case.params["radial"] == 6
-    assert repr(case) == (
-        "<Case beam-ring/Nr=4/Nh=3/steps=1/primal: 848 variables, 38 equalities, "
-        "37 inequalities, 0 bounds>"
-    )
-
-
 def test_a_point_yields_the_physical_results_of_its_case():
     case = mb.build("obstacle/dim=1/n=12/primal")  # exact at nodes: u = (|x| − 1)²
     answer = mb.solve(case, "clarabel")
@@ -92,10 +81,6 @@ def test_an_answer_is_drawn_and_written_for_paraview(answer, tmp_path):
     assert answer.save_vtu(tmp_path / "a.vtu").stat().st_size > 1000
     with pytest.raises(mb.InputError, match=r"unknown format '\.txt'"):
         answer.plot(tmp_path / "a.txt")
-
-
-def test_an_answer_shows_no_options_that_are_the_defaults(answer):
-    assert "solver                    smalbe\n" in repr(answer)
 
 
 def test_options_are_passed_on_and_history_can_be_switched_off():

@@ -96,14 +96,6 @@ def test_no_bound_of_a_short_search_is_exceeded(tries):
     assert ratio < 20
 
 
-@pytest.mark.slow
-def test_none_of_ten_thousand_attacked_bounds_is_exceeded():
-    failures, count, ratio = exceeded(3141, 12_000)
-    assert failures == []
-    assert count >= 10_000
-    assert ratio < 20
-
-
 @pytest.mark.parametrize("trap", ["", *KEPT])
 def test_the_bound_of_a_solution_is_at_the_level_of_rounding(trap):
     for seed in range(10):

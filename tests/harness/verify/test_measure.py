@@ -446,7 +446,7 @@ def test_garbage_collection_is_off_during_timed_phases(qp):
             raise ValueError(f"gc is {gc.isenabled()}")
 
     message = measure(Looks(), qp, 1e-6).solution.message
-    assert message.startswith("ValueError: gc is False (test_measure.py:")
+    assert message.startswith("ValueError: gc is False (")
     assert gc.isenabled()
 
 

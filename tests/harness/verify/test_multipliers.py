@@ -63,18 +63,6 @@ def test_a_solution_without_multipliers_is_proven(count, definite):
     assert max(worst) <= 1e-13
 
 
-def test_signs_of_computed_multipliers_are_those_of_their_bounds():
-    for seed in range(100):
-        qp, x = solved_qp(seed)
-        s = with_multipliers(qp, x)
-        at_lb, at_ub = x == qp.lb, x == qp.ub
-
-        assert (s.z >= 0).all()
-        assert np.abs(s.z_box[~at_lb & ~at_ub]).max(initial=0) <= 1e-12
-        assert (s.z_box[at_lb & ~at_ub] <= 0).all()
-        assert (s.z_box[at_ub & ~at_lb] >= 0).all()
-
-
 @pytest.mark.parametrize("count", SEARCHED)
 def test_a_point_beside_the_solution_has_no_multipliers(count):
     """With an error of 100·tol·max|xᵢ| in every component, a residual exceeds 10·tol.
@@ -111,14 +99,6 @@ def test_passed_multipliers_are_unchanged():
 
     assert (s.z.tolist(), s.z_box.tolist()) == ([0.5], [1.5])
     assert kkt_residuals(qp, s).worst == 0
-
-
-def test_a_point_that_holds_nan_gets_no_multipliers():
-    qp, x = solved_qp(3)
-    x = np.where(np.arange(x.size) == 0, np.nan, x)
-    s = with_multipliers(qp, x)
-
-    assert np.isnan(kkt_residuals(qp, s).worst)
 
 
 def test_too_many_multipliers_are_refused(monkeypatch):
