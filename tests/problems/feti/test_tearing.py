@@ -1,6 +1,5 @@
 """Bodies torn into subdomains, and their gluing rows."""
 
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
