@@ -1,6 +1,6 @@
 """Costs of SMALBE relative to its products, and races with other solvers.
 
-    python -m benchmarks.smalbe_costs dense|sparse|incomplete|subdomains|kept
+    python -m benchmarks.smalbe_costs dense|sparse|subdomains|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
 
 * dense: times to prepare and to solve dense duals, and the time of a product with F.
@@ -9,7 +9,6 @@
   smaller.
 * sparse: time of a solve without incomplete factors, divided by its number of products,
   in units of one product plus five vector operations w += v.
-* incomplete: sparse problems with and without incomplete factors.
 * subdomains: times to prepare and solve duals of bodies in subdomains, relative to the
   time of all products and all applications of the preconditioner. An earlier solve
   with the same operator has assembled the blocks.
@@ -18,7 +17,7 @@
 
 Runs that are compared with each other alternate in one process. Times are processor
 times of this process; set OMP_NUM_THREADS=1, because the times of threads are added.
-The script prints the median of the runs. Except in `incomplete` and `subdomains`, it
+The script prints the median of the runs. Except in `subdomains`, it
 also prints the median of the fastest tenth, on which other programs have less
 influence.
 """
@@ -53,18 +52,6 @@ LARGE = {
     "obstacle": {"dim": 2, "n": 257, "shape": "hemisphere"},
     "torsion": {"n": 100},
 }
-INCOMPLETE = {
-    "journal-bearing": [
-        {"n": 50, "eccentricity": 0.9}, {"n": 100, "eccentricity": 0.9},
-        {"n": 200, "eccentricity": 0.9}, {"n": 300},
-    ],
-    "string": [{"n": 1000}, {"n": 1000, "half": True}, {"n": 10_000}],
-    "obstacle": [
-        {"dim": 2, "n": 40, "shape": "flat"},
-        {"dim": 2, "n": 257, "shape": "hemisphere"},
-    ],
-    "torsion": [{"n": 30}, {"n": 100}, {"n": 200}],
-}  # fmt: skip
 SUBDOMAINS = (
     "membranes/S=2/n=8/dual", "membranes/S=4/n=8/dual", "membranes/S=8/n=8/dual",
     "membranes/S=16/n=16/dual", "beam-ring/Nr=16/Nh=8/feti=8/dual",
@@ -205,53 +192,6 @@ def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
         )
 
 
-def incomplete(tol: float = 1e-6) -> None:
-    """Print times of sparse QPs with bounds, with and without incomplete factors."""
-    print("case | products, factors, ms | without: products, ms | ratio of times")
-    for name, several in INCOMPLETE.items():
-        for params in several:
-            _incomplete(f"{name} {params}", sparse_qp(name, params), tol)
-
-
-def sparse_qp(name: str, params: dict[str, object]) -> QP:
-    """Return a primal QP.
-
-    params : keys of the family; with the additional key "half", the second half of the
-        variables has no lower bounds
-    """
-    given = {key: value for key, value in params.items() if key != "half"}
-    family = PROBLEMS[name]
-    qp = family.with_keys(**given).build("primal", reference_solution).qp
-    if "half" not in params:
-        return qp
-    lb = qp.lb.copy()
-    lb[qp.q.size // 2 :] = -np.inf
-    return QP(P=qp.P, q=qp.q, A=qp.A, b=qp.b, G=qp.G, h=qp.h, lb=lb, ub=qp.ub)
-
-
-def _incomplete(name: str, qp: QP, tol: float) -> None:
-    solvers = {
-        "factors": SOLVERS["smalbe"],
-        "without": replace(SOLVERS["smalbe"], preconditioner="model"),
-    }
-    counts = {name: s.prepare(qp, tol)().counts for name, s in solvers.items()}
-    times = in_turn(
-        5 if qp.q.size > 20_000 else 30,
-        **{
-            name: timed(lambda s=s: s.prepare(qp, tol)()) for name, s in solvers.items()
-        },
-    )
-    (ms, _), (before, _) = times["factors"], times["without"]
-    with_factors, without = counts["factors"], counts["without"]
-    print(
-        f"{name} | {with_factors['P_products']}, "
-        f"{with_factors.get('factorisations', 0)}, "
-        f"{1e3 * ms:.3g} | {without['P_products']}, {1e3 * before:.3g} | "
-        f"{ms / before:.2f}",
-        flush=True,
-    )
-
-
 def subdomains(tol: float = 1e-6) -> None:
     """Print times of duals of bodies in subdomains, whose blocks are assembled."""
     print(
@@ -382,7 +322,7 @@ def main() -> None:
     """Parse the command line and print the table."""
     parser = ArgumentParser(description="Measure costs of a solve with SMALBE.")
     tables = parser.add_subparsers(dest="table", required=True)
-    for name in ("dense", "sparse", "incomplete", "subdomains", "kept"):
+    for name in ("dense", "sparse", "subdomains", "kept"):
         tables.add_parser(name)
     race_parser = tables.add_parser("race", help="compare several solvers on a case")
     race_parser.add_argument("case")
@@ -391,8 +331,8 @@ def main() -> None:
     race_parser.add_argument("tolerances", nargs="?", default="1e-6,1e-8")
     arguments = vars(parser.parse_args())
     functions = {
-        "dense": dense, "sparse": sparse, "incomplete": incomplete,
-        "subdomains": subdomains, "kept": kept, "race": race,
+        "dense": dense, "sparse": sparse, "subdomains": subdomains, "kept": kept,
+        "race": race,
     }  # fmt: skip
     try:
         functions[arguments.pop("table")](**arguments)

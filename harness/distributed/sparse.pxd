@@ -25,7 +25,7 @@ cdef class CompressedRows(LinearMap):
 cdef class BorderedFactor(LinearMap):
     cdef Py_ssize_t inner, border
     cdef double scale
-    cdef object columns
+    cdef object columns, schur
     cdef tuple arrays
     cdef const int *order
     cdef const int *indptr

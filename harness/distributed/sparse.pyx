@@ -477,7 +477,9 @@ cdef class BorderedFactor(LinearMap):
         place[order] = np.arange(-self.inner, self.border, dtype=np.int32)
         L = np.zeros((0, 0))
         if self.border:
-            M = (1 + shift) * (corner @ corner.T)
+            if self.schur is None:
+                self.schur = corner @ corner.T
+            M = (1 + shift) * self.schur
             M -= columns.outer_products(removed, place, self.border)
             L, failed = lapack.dpotrf(M, lower=1)
             least = (1 - PIVOT_TOLERANCE) * shift * np.diag(corner) ** 2

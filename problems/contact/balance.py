@@ -19,7 +19,7 @@ normal to a single chord, so that a solver could turn the disc until an end touc
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,23 +45,12 @@ POLYGON = 16
 Floats = NDArray[np.float64]
 
 
-class _BodyMotion(NamedTuple):
-    """Rigid motion of one body."""
-
-    name: str
-    centre: Floats  #: (dim,) centre of the nodes, m
-    velocity: Floats  #: (dim,) velocity of the centre
-    #: (1,) in 2D, (3,) in 3D: velocity due to the rotation about each axis, at the
-    #: distance `size` from the centre; for `size`, see `_motions`
-    rotation: Floats
-
-
 def is_determined(bodies: UnassembledBodies, rows: Matrix) -> bool:
     """Return True if supports and closed, sticking contact exclude all rigid motions.
 
     rows : (m, n) normal rows, and tangential rows of contacts with friction
     """
-    R, _, _ = _motions(bodies)
+    R = _motions(bodies)
     allowed = _kernel(bodies.held @ R)
     return not _kernel(csr_array(rows) @ R @ allowed).shape[1]
 
@@ -74,11 +63,11 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     Raises
     ------
     InputError
-        If the load can move a body. The message names the body, and the direction or
-        the centre of rotation of its motion.
+        If the load can move a body. The message names the body, and the direction of
+        its motion unless it turns.
 
     """
-    R, centres, size = _motions(bodies)
+    R = _motions(bodies)
     allowed = _kernel(bodies.held @ R)  # Z = R·allowed
     if not allowed.shape[1]:  # the supports fix every body
         return
@@ -103,16 +92,23 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     motion = allowed @ _unbalanced_load(allowed.T @ load, closing @ allowed)
     if np.linalg.norm(motion) <= threshold:
         return
-    parts = motion.reshape(-1, modes)
-    moving = [
-        _BodyMotion(name, centre, part[:dim], part[dim:])
-        for name, centre, part in zip(names, centres, parts, strict=True)
-        if np.abs(part).max() > _MIN_MOTION * np.abs(parts).max()
-    ]
+    parts = np.abs(motion.reshape(-1, modes))
+    parts = parts > _MIN_MOTION * parts.max()
+    moving = [name for name, part in zip(names, parts, strict=True) if part.any()]
     held = {
         names[b] for b in bodies.piece_of_node[bodies.held.indices // bodies.mesh.dim]
     }
-    raise InputError(_imbalance_message(moving, size, held))
+    loose = [name for name in moving if name not in held] if len(moving) > 1 else []
+    what = "its load" if len(moving) == 1 else "their load"
+    if parts[:, dim:].any():
+        what = f"the moment of {what}"
+    else:
+        axes = [_AXES[axis] for axis in np.flatnonzero(parts.any(axis=0))]
+        what = f"{what} in {' and '.join(axes)}"
+    if loose:
+        have = "have" if len(loose) > 1 else "has"
+        what += f"; {' and '.join(map(repr, loose))} {have} no support"
+    raise InputError(_message(moving, what))
 
 
 def check_friction(
@@ -136,7 +132,7 @@ def check_friction(
         If no such forces exist. The message states the unbalanced fraction of the load.
 
     """
-    R, _, _ = _motions(bodies)
+    R = _motions(bodies)
     allowed = _kernel(bodies.held @ R)
     if not allowed.shape[1] or not friction.bound.size:
         return
@@ -220,20 +216,17 @@ def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
     return {"A_ub": A, "b_ub": np.repeat(friction.bound[vectors[:, 0]], POLYGON)}
 
 
-def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:
-    """Return R (n, r·bodies), the centres (bodies, dim) of rotation, and `size`, in m.
+def _motions(bodies: UnassembledBodies) -> Floats:
+    """Return the rigid motions R (n, r·bodies) of all bodies.
 
     The columns of a body are its translations, followed by rotations about its centre
-    that displace points at distance `size` by 1. With this scaling, all entries of Rᵀf
-    are forces.
+    that displace points at the distance of the extent of all bodies by 1. With this
+    scaling, all entries of Rᵀf are forces.
     """
-    size = float(np.ptp(bodies.mesh.points, axis=0).max())
-    parts = bodies.points_of_pieces
-    motions = [rigid_motions(part) for part in parts]
+    motions = [rigid_motions(part) for part in bodies.points_of_pieces]
     for R in motions:
-        R[:, bodies.mesh.dim :] /= size
-    centres = np.array([part.mean(axis=0) for part in parts])
-    return np.asarray(block_diag(*motions)), centres, size
+        R[:, bodies.mesh.dim :] /= float(np.ptp(bodies.mesh.points, axis=0).max())
+    return np.asarray(block_diag(*motions))
 
 
 def _kernel(A: Floats, tolerance: float = 1e-9) -> Floats:
@@ -274,51 +267,6 @@ def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
     except RuntimeError:  # reaching the iteration limit does not prove an imbalance
         return np.zeros_like(load)
     return np.asarray(load - A @ forces)
-
-
-def _imbalance_message(moving: list[_BodyMotion], size: float, held: set[str]) -> str:
-    """Return the message about an unbalanced force or moment.
-
-    held : names of the bodies with a support; if several bodies move together, the
-        message lists those without a support
-    """
-    names = [body.name for body in moving]
-    its = "its" if len(names) == 1 else "their"
-    loose = [name for name in names if name not in held] if len(names) > 1 else []
-    free = (
-        f"; {' and '.join(map(repr, loose))} {'have' if len(loose) > 1 else 'has'} no "
-        "support"
-        if loose
-        else ""
-    )
-    turning = max(moving, key=lambda body: float(np.abs(body.rotation).max()))
-    sliding = max(moving, key=lambda body: float(np.abs(body.velocity).max()))
-    most = float(np.abs(sliding.velocity).max())
-    if np.abs(turning.rotation).max() <= _MIN_MOTION * most:
-        axes = [
-            axis
-            for axis, v in zip(_AXES, sliding.velocity, strict=False)
-            if abs(v) > _MIN_MOTION * most
-        ]
-        return _message(names, f"{its} load in {' and '.join(axes)}{free}")
-    who = "it" if len(names) == 1 else repr(turning.name)
-    return _message(
-        names,
-        f"the moment of {its} load: {who} can turn about {_pivot(turning, size)}{free}",
-    )
-
-
-def _pivot(turning: _BodyMotion, size: float) -> str:
-    """Describe the pivot of a planar rotation, or the axis of a screw motion."""
-    if turning.rotation.size == 1:
-        (x, y), (vx, vy) = turning.centre, turning.velocity * size / turning.rotation
-        return f"({x - vy:.4g}, {y + vx:.4g}) m"
-    about_z, about_minus_y, about_x = turning.rotation
-    axis = np.array([about_x, -about_minus_y, about_z])
-    at = turning.centre + size * np.cross(axis, turning.velocity) / (axis @ axis)
-    along = np.round(axis / np.linalg.norm(axis), 3) + 0.0  # no negative zeros
-    point, direction = (", ".join(f"{x:.4g}" for x in v) for v in (at, along))
-    return f"the axis through ({point}) m along ({direction})"
 
 
 def _message(names: list[str], what: str) -> str:

@@ -350,10 +350,10 @@ def largest_stresses(torn: TornBodies, elastic: ElasticBodies, u: Vector) -> Vec
         for _ in range(STRESS_LAYERS):
             selected = of_body & near[cells].any(axis=1)
             near[cells[selected]] = True
-        node, corner = np.unique(cells[selected], return_inverse=True)
+        node = np.flatnonzero(near)
         if not node.size:
             continue
-        part = Mesh(points[node], corner.reshape(-1, cells.shape[1]), {})
+        part = Mesh(points[node], np.cumsum(near)[cells[selected]] - 1, {})
         stress = recover(part, centre_stress(part, D[b], u[node].ravel()))[inner[node]]
         largest[b] = von_mises(stress, material.nu, plane).max()
     return largest

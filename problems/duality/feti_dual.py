@@ -86,14 +86,12 @@ class TornDual:
         """Return u = (TᵀT)⁻¹Tᵀv (n,), the average over the copies of each node.
 
         The torn displacement is v = K⁺(f − Bᵀλ) − Rα, where α are the multipliers of
-        RᵀBᵀλ = Rᵀf. At the solution, all copies are equal. Eliminated components have
-        no copy, and u = 0 there.
+        RᵀBᵀλ = Rᵀf. At the solution, all copies are equal.
         """
         B, T, f = self.torn.rows.B, self.torn.spread, self.torn.f
         v = self.served.lead("domains.inverse", f - B.T @ s.x) - self.R @ s.y
-        component = self.torn.component[self.torn.free]
-        copies = np.bincount(component, minlength=T.shape[1])
-        return np.asarray((T.T @ v) / np.maximum(copies, 1))
+        copies = np.bincount(self.torn.component, minlength=T.shape[1])
+        return np.asarray((T.T @ v) / copies)
 
     def multipliers(self, s: Solution) -> Vector:
         """Return the multipliers (m_I,) of the unscaled contact and friction rows."""

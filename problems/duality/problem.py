@@ -7,7 +7,6 @@ processes.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -48,27 +47,13 @@ if TYPE_CHECKING:
 Linearise: TypeAlias = Callable[[Vector], ContactRows]
 
 
-class Shape(ABC):
-    """Geometry of bodies; the mesh is generated on first use."""
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Geometry of bodies."""
 
-    @property
-    @abstractmethod
-    def joined(self) -> tuple[Mesh, Nodes]:
-        """Joined mesh of all bodies, m, and the body (E,) of each cell."""
-
-    @abstractmethod
-    def layout(self, size: int) -> Subdivision:
-        """Return a subdivision; the meaning of `size` depends on the shape."""
-
-    @property
-    def mesh(self) -> Mesh:
-        """Joined mesh of all bodies, m."""
-        return self.joined[0]
-
-    @property
-    def body(self) -> NDArray[np.int64]:
-        """Body of each cell, (E,)."""
-        return self.joined[1]
+    mesh: Mesh  #: joined mesh of all bodies, m
+    body: NDArray[np.int64]  #: (E,) body of each cell
+    parts: tuple[Mesh, ...] = ()  #: mesh of each body; empty for unstructured meshes
 
     @property
     def dim(self) -> int:
@@ -80,48 +65,25 @@ class Shape(ABC):
         """Contact sides by name: chains of nodes in 2D, faces in 3D."""
         return self.mesh.boundaries
 
-
-@dataclass(frozen=True, eq=False)
-class Structured(Shape):
-    """Structured meshes: plane grids, half discs or boxes of hexahedra."""
-
-    #: one mesh per body; the names of all boundaries are distinct
-    parts: tuple[Mesh, ...]
-
-    @cached_property
-    def joined(self) -> tuple[Mesh, Nodes]:
-        """Joined mesh of all bodies, m, and the body (E,) of each cell."""
-        return join(self.parts)
-
     def layout(self, size: int) -> Subdivision:
-        """Cut the bodies into blocks of at most `size` cells per side.
+        """Cut the bodies into subdomains.
 
-        Blocks of half discs and of boxes are compact.
+        size : largest number of cells along a side of a subdomain; for unstructured
+            meshes, which METIS cuts, the number of subdomains
         """
-        from mortarbench.problems.feti.structured import blocks_of_meshes
-
-        return blocks_of_meshes(self.parts, size, self.joined)
-
-
-@dataclass(frozen=True, eq=False)
-class Meshed(Shape):
-    """Unstructured mesh; METIS cuts it into as many parts as `layout` receives."""
-
-    given: tuple[Mesh, Nodes]  #: mesh and body (E,) of each cell
-
-    @property
-    def joined(self) -> tuple[Mesh, Nodes]:
-        """Mesh of all bodies, m, and the body (E,) of each cell."""
-        return self.given
-
-    def layout(self, size: int) -> Subdivision:
-        """Cut the bodies into `size` subdomains by graph partitioning."""
         from mortarbench.problems.feti.partition import graph_partition
+        from mortarbench.problems.feti.structured import blocks_of_meshes
         from mortarbench.problems.feti.subdivision import Subdivision
 
-        mesh, body = self.joined
-        label = graph_partition(mesh.points, mesh.cells, body, size)
-        return Subdivision(mesh, label, body)
+        if self.parts:
+            return blocks_of_meshes(self.parts, size, (self.mesh, self.body))
+        label = graph_partition(self.mesh.points, self.mesh.cells, self.body, size)
+        return Subdivision(self.mesh, label, self.body)
+
+
+def structured(*parts: Mesh) -> Shape:
+    """Return the shape of structured bodies with distinct names of all boundaries."""
+    return Shape(*join(parts), parts)
 
 
 #: fields that `ElasticBodies` and `UnassembledBodies` have in common
@@ -156,7 +118,7 @@ class ElasticBodies:
     @cached_property
     def whole(self) -> UnassembledBodies:
         """The undivided bodies without stiffness matrix."""
-        mesh, body = self.shape.joined
+        mesh, body = self.shape.mesh, self.shape.body
         common: dict[str, Any] = {name: getattr(self, name) for name in COMMON}
         return UnassembledBodies(
             mesh=mesh,
@@ -198,7 +160,7 @@ def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
     """Return meshed bodies as `ElasticBodies`; an assembled stiffness is kept."""
     common: dict[str, Any] = {name: getattr(bodies, name) for name in COMMON}
     result = ElasticBodies(
-        shape=Meshed((bodies.mesh, bodies.body)),
+        shape=Shape(bodies.mesh, bodies.body),
         fixed=bodies.B_D.indices,
         forces=forces_of(bodies.f),
         **common,

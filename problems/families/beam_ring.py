@@ -35,8 +35,8 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
     Shape,
-    Structured,
     keyed_linearisation,
+    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material, Plane
@@ -188,7 +188,7 @@ def bodies(
     ]
     if depth:
         parts = [extruded(part, depth, THICKNESS) for part in parts]
-    shape = Structured(tuple(parts))
+    shape = structured(*parts)
     by_name = shape.sides
     # in 2D, these are m_E = 2(Nr + 1) + 4(radial + 1) components
     clamped = [

@@ -22,7 +22,7 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
     ElasticBodies,
-    Structured,
+    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material
@@ -55,7 +55,7 @@ class CubeWall(ContactFamily):
     def problem(self) -> ContactProblem:
         """Return the contact problem of the cube with n × n × n cells."""
         mesh = box((0.0,) * 3, (SIDE,) * 3, (self.n,) * 3)
-        shape = Structured((mesh,))
+        shape = structured(mesh)
         top, areas = nodal_areas(mesh.points, shape.sides["top"])
         forces = Forces(dofs_of(top, 3, 2), -PRESSURE * areas / FORCE)
         right, bottom = shape.sides["right"], np.unique(shape.sides["bottom"])

@@ -688,10 +688,6 @@ class Plate(DecomposedFamily):
     The load acts at the upper right corner (``point``), as a constant traction on the
     right edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
 
-    Supports are rows of B as in the other decomposed problems (Total FETI), or they are
-    ``eliminated``. In the latter case, subdomains at the clamped edge do not float, as
-    in FETI-1 (Farhat and Roux 1991).
-
     In 3D (dim=3) the plate is a box of Sx × Sy × Sz subdomains with n cells along z. It
     is clamped at x = 0 and pulled along −z by 1 MN on the face at the largest x, or at
     its corner of largest y and z (``point``).
@@ -712,9 +708,6 @@ class Plate(DecomposedFamily):
     jump: Annotated[float, POSITIVE, "ratio of the two moduli"] = 1.0
     load: Annotated[Literal["point", "edge", "nodal"], "place of the load"] = "edge"
     plane: PlaneState = "strain"
-    supports: Annotated[
-        Literal["rows", "eliminated"], "supports as rows of B, or eliminated"
-    ] = "rows"
     glue: Glue = "orthonormal"
     dim: Dimension = 2
     Sz: Annotated[int, Range(1), "subdomains along z in 3D"] = 1
@@ -737,11 +730,6 @@ class Plate(DecomposedFamily):
             refuse_unused(self, "Sz", "dim=2", "dim=3")
         else:
             check_plane_only(self, "dim=3")
-        if self.supports == "eliminated" and math.prod(self.counts) == 1:
-            raise InputError(
-                "supports=eliminated leaves a single subdomain without any row of "
-                "constraints; expected more subdomains, or supports=rows"
-            )
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -899,7 +887,6 @@ class Plate(DecomposedFamily):
             assemble_class=partial(elastic_class, D=self.D, E=self.moduli),
             load=_pull(mesh, self.load).on(mesh.dofs),
             fixed=self.clamped,
-            eliminated=self.supports == "eliminated",
             contact=Contact(no_rows(self.dim * layout.nodes), none, none),
         )
 

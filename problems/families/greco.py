@@ -36,7 +36,7 @@ from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
-    Structured,
+    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material
@@ -119,7 +119,7 @@ class Greco(ContactFamily):
         on_rigid = ContactPair(ground, ground[:0], rigid)
         return ContactProblem(
             bodies=ElasticBodies(
-                shape=Structured((mesh,)),
+                shape=structured(mesh),
                 names=("plate",),
                 materials=(MATERIAL,),
                 plane="strain" if dim == 2 else None,

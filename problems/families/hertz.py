@@ -77,7 +77,7 @@ from mortarbench.problems.duality.problem import (
     ElasticBodies,
     Linearise,
     Shape,
-    Structured,
+    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.families.line_contact import LineContact, TangentialContact
@@ -288,7 +288,7 @@ def _cylinder_on_plane(
         keys.load * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, keys.plane)
     )
     a = min(exact.a, RADIUS)  # see `half_cylinders`
-    shape = Structured((_half_cylinder(RADIUS, a / keys.n, a, keys.halvings),))
+    shape = structured(_half_cylinder(RADIUS, a / keys.n, a, keys.halvings))
     sides = shape.sides
     return ElasticBodies(
         shape=shape,
@@ -370,7 +370,7 @@ def two_cylinders(keys: HertzCylinder) -> tuple[ElasticBodies, LineContact]:
     a, halvings = min(exact.a, RADIUS), keys.halvings
     upper = _half_cylinder(RADIUS, a / keys.n, a, halvings)
     lower = _half_cylinder(-RADIUS, a / keys.m, a, halvings)
-    shape = Structured((prefixed(upper, "upper_"), prefixed(lower, "lower_")))
+    shape = structured(prefixed(upper, "upper_"), prefixed(lower, "lower_"))
     sides, flat = shape.sides, shape.sides["lower_flat"]
     forces, on_axis = [_pressing(shape, "upper_flat", 1.0)], _on_axis(sides, "lower_")
     if keys.peak:

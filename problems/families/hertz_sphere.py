@@ -58,8 +58,8 @@ from mortarbench.problems.duality.problem import (
     ContactSolution,
     ElasticBodies,
     Linearise,
-    Structured,
     keyed_linearisation,
+    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.families.half_space.point_contact import (
@@ -268,7 +268,7 @@ class HertzSphere(ContactFamily):
         meshes = (prefixed(b.mesh, k) for b, k in zip(blocks, names, strict=True))
         return ContactProblem(
             bodies=ElasticBodies(
-                shape=Structured(tuple(meshes)),
+                shape=structured(*meshes),
                 names=names,
                 materials=(material,) * len(names),
                 plane=None,

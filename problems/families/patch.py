@@ -51,8 +51,8 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
     ElasticBodies,
-    Structured,
     keyed_linearisation,
+    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material
@@ -155,7 +155,7 @@ class ContactPatch(ContactFamily):
 
         def error(answer: ContactSolution) -> dict[str, Any]:
             """Return the largest |σ_y + p|/p (in 3D |σ_z + p|/p) at Gauss points."""
-            mesh, body = elastic.shape.joined
+            mesh, body = elastic.shape.mesh, elastic.shape.body
             u = answer.at(np.arange(mesh.dofs)) * elastic.length
             vertical = gauss_stress(mesh, D[body], u)[..., mesh.dim - 1]
             largest = np.abs(vertical + PRESSURE).max() / PRESSURE
@@ -308,7 +308,7 @@ def bodies(patch: ContactPatch) -> ElasticBodies:
     In 3D, the numbers of cells along y are the same.
     """
     dim, force = patch.dim, PRESSURE * LENGTH ** (patch.dim - 1)
-    shape = Structured(tuple(map(prefixed, _blocks(patch), ("lower_", "upper_"))))
+    shape = structured(*map(prefixed, _blocks(patch), ("lower_", "upper_")))
     sides = shape.sides
     walls = ("left", "front", "bottom") if dim == 3 else ("left", "bottom")
     rollers = [

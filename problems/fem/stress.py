@@ -22,12 +22,14 @@ from mortarbench.harness import Vector
 from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.fem.elasticity import (
     Plane,
-    cell_dofs,
     mean_dilatation,
     shape_gradients,
     strain_matrix,
 )
-from mortarbench.problems.fem.mesh import Mesh
+from mortarbench.problems.fem.mesh import Mesh, dofs_of
+
+#: number of cells that are evaluated at a time to limit the memory
+STRIP_CELLS = 2**14
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
@@ -59,9 +61,14 @@ def gauss_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.fl
 def _stress_at(
     point: Vector, mesh: Mesh, D: NDArray[np.float64], u: Vector
 ) -> NDArray[np.float64]:
-    gradients, _ = shape_gradients(mesh.points[mesh.cells], point)
-    DB = D @ strain_matrix(gradients)
-    stress: NDArray[np.float64] = np.einsum("esd,ed->es", DB, u[cell_dofs(mesh)])
+    stress = np.empty((len(mesh.cells), D.shape[-1]))
+    for first in range(0, len(stress), STRIP_CELLS):
+        strip = slice(first, first + STRIP_CELLS)
+        cells = mesh.cells[strip]
+        gradients, _ = shape_gradients(mesh.points[cells], point)
+        DB = (D if D.ndim == 2 else D[strip]) @ strain_matrix(gradients)
+        u_e = u[dofs_of(cells, mesh.dim)].reshape(len(cells), -1)
+        stress[strip] = np.einsum("esd,ed->es", DB, u_e)
     return stress
 
 
@@ -69,7 +76,6 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Recover nodal values (N, k) from cell-centre values (E, k) by patch recovery."""
     corner = np.ones(mesh.cells.shape, dtype=bool)
     corner[:, 1:] = mesh.cells[:, 1:] != mesh.cells[:, :-1]
-    nodes, cells = mesh.cells[corner], np.nonzero(corner)[0]
     N, dim = mesh.points.shape
     k, terms = values.shape[1], dim + 1
     size = np.ptp(mesh.points, axis=0).max()
@@ -78,15 +84,17 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         axis=1,
         weights=np.broadcast_to(corner[..., None], (*corner.shape, dim)),
     )
-    offset = (centre[cells] - mesh.points[nodes]) / size
-    # basis 1, x, … relative to the node, in units of the extent of the mesh
-    basis = np.column_stack([np.ones(len(nodes)), offset])
-    normal, right = np.empty((N, terms, terms)), np.empty((N, terms, k))
-    for p, q in combinations_with_replacement(range(terms), 2):
-        sums = np.bincount(nodes, basis[:, p] * basis[:, q], N)
-        normal[:, p, q] = normal[:, q, p] = sums
-    for p, q in np.ndindex(terms, k):
-        right[:, p, q] = np.bincount(nodes, basis[:, p] * values[cells, q], N)
+    normal, right = np.zeros((N, terms, terms)), np.zeros((N, terms, k))
+    for nodes, own in zip(mesh.cells.T, corner.T, strict=True):
+        cells, nodes = np.flatnonzero(own), nodes[own]
+        # basis 1, x, … relative to the node, in units of the extent of the mesh
+        offset = (centre[cells] - mesh.points[nodes]) / size
+        basis = np.column_stack([np.ones(nodes.size), offset])
+        for p, q in combinations_with_replacement(range(terms), 2):
+            normal[:, p, q] += np.bincount(nodes, basis[:, p] * basis[:, q], N)
+            normal[:, q, p] = normal[:, p, q]
+        for p, q in np.ndindex(terms, k):
+            right[:, p, q] += np.bincount(nodes, basis[:, p] * values[cells, q], N)
 
     interior = np.ones(N, dtype=bool)
     interior[boundary_facets(mesh.cells, dim)] = False

@@ -64,9 +64,9 @@ def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
     kernel, rigid = [none], [none]
     for b, name in enumerate(problem.names):
         fixed, axes = node[body == b], axis[body == b]
-        of_body = np.unique(
-            layout.torn.number[problem.piece_of[layout.torn.subdomain] == b]
-        )
+        is_inside = np.zeros(layout.nodes, dtype=bool)
+        is_inside[layout.mesh.cells[problem.piece_of[layout.label] == b]] = True
+        of_body = np.flatnonzero(is_inside)
         points, dofs = layout.mesh.points[of_body], dofs_of(of_body, d)
         R = (
             rigid_modes(points)

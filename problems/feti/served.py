@@ -41,7 +41,7 @@ class Served:
 
     @property
     def domains(self) -> Subdomains:
-        """The subdomains without eliminated components."""
+        """The subdomains."""
         return self.torn.domains
 
     @cached_property
@@ -60,7 +60,7 @@ class Served:
     @cached_property
     def parts(self) -> LocalProblems:
         """The local problems for certificates; supports are rows of B."""
-        return LocalProblems(self.torn.floating)
+        return LocalProblems(self.torn)
 
     def weights(self) -> Vector:
         """Return the weights of the local problems, (N,)."""

@@ -15,13 +15,13 @@ block per copy of a node.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, lapack, null_space, qr
+from scipy.linalg import cho_solve, lapack
 from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze, cholesky
 
@@ -251,24 +251,6 @@ class Subdomains:
                 v[places] = template.inverse(columns)
         return self.combined(v)
 
-    def restrict(self, free: NDArray[np.bool_]) -> Subdomains:
-        """Return the subdomains restricted to the torn unknowns in the mask (N,)."""
-        numbers, class_of = dict[tuple[int, bytes], int](), np.empty_like(self.class_of)
-        masks = list[tuple[int, NDArray[np.bool_]]]()
-        for s, k in enumerate(self.class_of.tolist()):
-            mask = free[self.start[s] : self.start[s + 1]]
-            number = numbers.setdefault((k, mask.tobytes()), len(masks))
-            if number == len(masks):
-                masks.append((k, mask))
-            class_of[s] = number
-
-        def template(number: int) -> SubdomainClass:
-            k, mask = masks[number]
-            return _restricted(self.template(k), mask)
-
-        sizes = np.array([np.count_nonzero(mask) for _, mask in masks])
-        return replace(self, template=cache(template), sizes=sizes, class_of=class_of)
-
 
 def upper_triangle(M: Dense) -> Vector:
     """Return the upper triangle of a symmetric matrix, column by column."""
@@ -277,22 +259,3 @@ def upper_triangle(M: Dense) -> Vector:
 
 def _symmetric(M: Dense) -> Dense:
     return np.asarray((M + M.T) / 2)
-
-
-def _restricted(kind: SubdomainClass, free: NDArray[np.bool_]) -> SubdomainClass:
-    """Return a class restricted to the components in the mask `free` (n_k,).
-
-    The new kernel consists of the motions of R that vanish at the fixed components.
-    """
-    if free.all():
-        return kind
-    R = kind.R @ null_space(kind.R[~free])
-    R = np.linalg.qr(R[free])[0]
-    number = np.cumsum(free) - 1
-    return SubdomainClass(
-        K=csc_array(kind.K[free][:, free]),
-        R=R,
-        fixing=np.sort(qr(R.T, mode="r", pivoting=True)[1][: R.shape[1]]),
-        boundary=number[kind.boundary[free[kind.boundary]]],
-        stiffness=kind.stiffness[free],
-    )

@@ -6,9 +6,8 @@ each rank assembles for its own subdomains only
 (`problems.feti.subdomain_classes.Subdomains`).
 
 B consists of support, gluing and contact rows, in this order (Total FETI, Dostál, Horák
-and Kučera 2006). Every copy of a fixed component has a support row, unless fixed
-components are eliminated. The m copies v_1 … v_m of a free component are glued by one
-of
+and Kučera 2006). Every copy of a fixed component has a support row. The m copies
+v_1 … v_m of a free component are glued by one of
 
 * ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
@@ -97,10 +96,6 @@ class DecomposedProblem:
     fixed: Nodes  #: prescribed global components, in the order of their rows
     #: (n,) prescribed displacements, and zeros; None: all are zero
     lift: Vector | None = None
-    #: True to eliminate fixed components, as in FETI-1 (Farhat and Roux 1991), instead
-    #: of adding rows to B. Subdomains with supports then do not float and keep the
-    #: global axes
-    eliminated: bool = False
     contact: Contact
     glue: str  #: name of the gluing, one of `GLUE`
 
@@ -159,40 +154,25 @@ class TornBodies:
 
     @cached_property
     def component(self) -> Nodes:
-        """Component of each torn unknown, including eliminated components."""
+        """Component of each torn unknown."""
         d = self.problem.components
         return np.asarray((d * self.nodes.number[:, None] + np.arange(d)).ravel())
-
-    @cached_property
-    def free(self) -> slice | Nodes:
-        """Indices of the torn unknowns among all components of all torn nodes."""
-        if not self.problem.eliminated:
-            return slice(None)
-        return np.flatnonzero(~np.isin(self.component, self.problem.fixed))
-
-    @property
-    def multiplicity(self) -> NDArray[np.int64]:
-        """Number of copies of each torn unknown, (N,)."""
-        multiplicity = np.repeat(self.nodes.multiplicity, self.problem.components)
-        return np.asarray(multiplicity[self.free])
 
     @cached_property
     def spread(self) -> csr_array:
         """T (N, n), which maps displacements to torn unknowns in subdomain axes.
 
         Each torn node has a block Qᵀ, the transpose of the rotation of its subdomain.
-        Eliminated components have no rows.
         """
         d, place = self.problem.components, self.nodes.number
         M, n = place.size, d * self.problem.layout.nodes
         if d == 1:
-            T = csr_array((np.ones(M), place, np.arange(M + 1)), shape=(M, n))
-        else:
-            turn = self.rotation[self.nodes.subdomain].transpose(0, 2, 1)
-            blocks = np.ascontiguousarray(turn), place, np.arange(M + 1)
-            T = csr_array(bsr_array(blocks, shape=(d * M, n)))
-            T.eliminate_zeros()
-        return csr_array(T[self.free]) if self.problem.eliminated else T
+            return csr_array((np.ones(M), place, np.arange(M + 1)), shape=(M, n))
+        turn = self.rotation[self.nodes.subdomain].transpose(0, 2, 1)
+        blocks = np.ascontiguousarray(turn), place, np.arange(M + 1)
+        T = csr_array(bsr_array(blocks, shape=(d * M, n)))
+        T.eliminate_zeros()
+        return T
 
     @cached_property
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
@@ -225,22 +205,10 @@ class TornBodies:
         """Rotations (S, dim, dim) from the axes of each class to the global axes."""
         return self._classified[1]
 
-    @cached_property
-    def domains(self) -> Subdomains:
-        """The subdomains, without eliminated components."""
-        domains = self._classified[0]
-        if self.problem.eliminated:
-            free = np.zeros(int(domains.start[-1]), dtype=bool)
-            free[self.free] = True
-            domains = domains.restrict(free)
-        return domains
-
     @property
-    def floating(self) -> TornBodies:
-        """The same problem with supports as rows of B, so that all subdomains float."""
-        if not self.problem.eliminated:
-            return self
-        return self.with_problem(replace(self.problem, eliminated=False))
+    def domains(self) -> Subdomains:
+        """The subdomains."""
+        return self._classified[0]
 
     @cached_property
     def f(self) -> Vector:
@@ -253,7 +221,7 @@ class TornBodies:
             loaded = np.flatnonzero(shared.any(axis=1))
             rotation = self.rotation[self.nodes.subdomain[loaded]]
             shared[loaded] = np.einsum("mkq,mk->mq", rotation, shared[loaded])
-        return np.asarray(load[self.free])
+        return np.asarray(load)
 
     def row_stiffness(self, node: Nodes, *, supports: bool) -> Vector:
         """Return the factors (k,) at torn nodes whose square roots scale rows of B.
@@ -289,8 +257,8 @@ class TornBodies:
     def with_problem(self, problem: DecomposedProblem) -> TornBodies:
         """Return the subdomains of a problem that has the same bodies.
 
-        Load, contact and treatment of supports may differ. The classes of subdomains
-        are reused because their assembly is expensive.
+        Load and contact may differ. The classes of subdomains are reused because their
+        assembly is expensive.
         """
         copy = replace(self, problem=problem)
         same = ("_classified", "component")
@@ -338,16 +306,12 @@ def subdomain_ranks(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]
 def _rows(torn: TornBodies) -> Rows:
     """Assemble the rows of B, in the order of supports, gluing and contact."""
     problem, d = torn.problem, torn.problem.components
-    entries = [_gluing_rows(torn), _contact_rows(torn)]
-    if not problem.eliminated:
-        entries.insert(0, _support_rows(torn))
+    entries = [_support_rows(torn), _gluing_rows(torn), _contact_rows(torn)]
     row, column, value = (np.concatenate(p) for p in zip(*entries, strict=True))
     contact, scale = problem.contact, problem.contact_scale
     E = _equality_count(problem)
     shape = E + scale.size, d * torn.nodes.number.size
     B = csr_array((value, (row, column)), shape=shape)
-    if problem.eliminated:
-        B = csr_array(B[:, torn.free])
     c = np.append(np.zeros(E), scale * contact.c)
     if problem.lift is not None:
         supports = slice(0, int(problem.layout.multiplicity(problem.fixed // d).sum()))
@@ -385,7 +349,7 @@ def _gluing_rows(torn: TornBodies) -> Entries:
     d = problem.components
     fixed = np.sort(problem.fixed)
     fixed_multiplicity = of.multiplicity(fixed // d)
-    base = 0 if problem.eliminated else int(fixed_multiplicity.sum())
+    base = int(fixed_multiplicity.sum())
     none = np.zeros(0, dtype=np.int64)
     parts = [Entries(none, none, np.zeros(0))]
     for m, nodes_with in sorted(of.nodes_by_multiplicity.items()):
@@ -452,4 +416,4 @@ def _equality_count(problem: DecomposedProblem) -> int:
         len(GLUE[problem.glue](m)) * (d * count - int((multiplicity == m).sum()))
         for m, count in of.nodes_by_multiplicity.items()
     )
-    return glued if problem.eliminated else int(multiplicity.sum()) + glued
+    return int(multiplicity.sum()) + glued

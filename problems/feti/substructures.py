@@ -15,6 +15,10 @@ from mortarbench.harness.mechanics import in_precision
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import TornBodies
 
+#: number of subdomains whose products are computed at a time, so that their vectors
+#: stay in the cache
+STRIP_COLUMNS = 32
+
 
 @dataclass(frozen=True, eq=False)
 class LocalProblems:
@@ -69,13 +73,16 @@ class LocalProblems:
         P is the orthogonal projector that removes rigid motions.
         """
         image, domains = np.zeros_like(v), self.torn.domains
-        for template, place in domains.places():
-            place = place[:, (v[place] != 0).any(axis=0)]  # PKP maps zero to zero
-            columns, R = v[place], template.R
-            columns -= R @ (R.T @ columns)
-            columns = in_precision(template.K, v.dtype) @ columns
-            columns -= R @ (R.T @ columns)
-            image[place] = columns
+        for template, every in domains.places():
+            K, R = in_precision(template.K, v.dtype), template.R
+            for first in range(0, every.shape[1], STRIP_COLUMNS):
+                place = every[:, first : first + STRIP_COLUMNS]
+                place = place[:, (v[place] != 0).any(axis=0)]  # PKP maps zero to zero
+                columns = v[place]
+                columns -= R @ (R.T @ columns)
+                columns = K @ columns
+                columns -= R @ (R.T @ columns)
+                image[place] = columns
         return domains.combined(image)
 
     def squared_product(self, v: Vector) -> Vector:

@@ -32,7 +32,7 @@ SLOW_CASES = (
     "cube-wall/n=4/feti=2/dual",
     "obstacle/n=10/shape=hemisphere/feti=3/dual",
     "plate/Sx=3/Sy=3/n=2/pattern=column/jump=10/glue=redundant/dual",
-    "plate/Sx=3/Sy=3/n=2/supports=eliminated/dual",
+    "plate/Sx=3/Sy=3/n=2/dual",
 )
 
 

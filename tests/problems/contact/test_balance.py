@@ -71,11 +71,9 @@ def test_loads_that_press_down_within_the_support_are_balanced():
         ([("lower", "bottom", "y")], [*DOWN, ("lower", "top left", [9, 0])],
          "body 'lower': nothing balances its load in x;"),
         ([SUPPORT], [*DOWN, ("upper", "top left", [0, 1.5e6])],
-         "body 'upper': nothing balances the moment of its load: it can turn about "
-         "(1, "),
+         "body 'upper': nothing balances the moment of its load;"),
         ([SUPPORT, ("upper", "bottom left", "xy")], [("upper", "bottom right", [0, 7])],
-         "body 'upper': nothing balances the moment of its load: it can turn about "
-         "(-1, 0) m;"),
+         "body 'upper': nothing balances the moment of its load;"),
         ([("upper", "top left", "xy"), ("upper", "top right", "y"),
           ("lower", "left", "x")], [("lower", "top left", [0, -9])],
          "body 'lower': nothing balances its load in y;"),

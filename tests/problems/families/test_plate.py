@@ -23,7 +23,7 @@ pytestmark = pytest.mark.together
 #: test of MSolve (Papagiannakis 2011); E of the left column is 1/1000 of E elsewhere
 CANTILEVER = (
     "plate/Sy=2/n=5/ny=10/width=3.0/height=1.5/pattern=column/jump=0.001/load=nodal/"
-    "plane=stress/supports=eliminated/glue=redundant"
+    "plane=stress/glue=redundant"
 )
 CUBES = {"dim": 3, "Sx": 2, "Sy": 2, "Sz": 2}
 #: keys; number of multipliers; κ(PFP), ‖PFP‖, κ lumped, κ Dirichlet
@@ -84,27 +84,16 @@ def test_condition_numbers_with_jumps_are_those_of_a_prototype(jump, name, value
     assert values[name] == pytest.approx(value, rel=3e-5)
 
 
-def test_the_cantilever_of_msolve_has_its_sizes():
-    keys = {"Sy": 2, "n": 5, "ny": 10, "supports": "eliminated", "glue": "redundant"}
-    torn, floating = torn_plate(**keys), torn_plate(**keys | {"supports": "rows"})
-    assert torn.rows.c.size == 190  # fixed nodes are not glued
-    assert floating.f.size == 1056
-    assert torn.f.size == 1056 - 44
-    domains = torn.domains
-    modes = [domains.template(k).R.shape[1] for k in domains.class_of]
-    assert modes == [0, 3, 3, 3] * 2  # the clamped column does not float
-
-
 @pytest.mark.parametrize(
     "name",
     [
         *(f"plate/pattern=checkerboard/jump=100.0/glue={glue}"
           for glue in ("orthonormal", "redundant")),
-        "plate/Sx=3/Sy=2/n=3/load=point/supports=eliminated",
+        "plate/Sx=3/Sy=2/n=3/load=point",
         CANTILEVER,
         *(f"plate/Sx=2/Sy=3/n=2/ny=1/pattern=checkerboard/jump=100.0/glue={glue}/dim=3"
           "/Sz=2" for glue in ("orthonormal", "redundant")),
-        "plate/Sx=2/Sy=2/n=2/load=point/supports=eliminated/dim=3/Sz=2",
+        "plate/Sx=2/Sy=2/n=2/load=point/dim=3/Sz=2",
     ],
 )  # fmt: skip
 def test_the_dual_has_the_displacement_of_the_plate(name):
@@ -139,7 +128,6 @@ def test_every_load_pulls_with_one_meganewton(load, keys):
         ({"glue": "tape"}, "'orthonormal' or 'redundant'"),
         ({"Sx": 0}, "Sx=0 must be at least 1"),
         ({"width": -1.0}, "width=-1.0 must be between 0 and"),
-        ({"Sx": 1, "Sy": 1, "supports": "eliminated"}, "without any row"),
         ({"Sz": 2}, "Sz=2 is not used by dim=2"),
         ({"dim": 3, "plane": "stress"}, "plane=stress with dim=3 is not built"),
     ],

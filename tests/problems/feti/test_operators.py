@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, null_space
-from scipy.sparse import csc_array, csr_array, eye_array
+from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, no_rows
 from mortarbench.harness.files.qpfile import load_qp, save_qp
@@ -300,14 +300,3 @@ def test_equal_subdomains_share_one_stored_stiffness():
     few, many = (operator_of(membranes(size=S)).arrays for S in (1, 3))
     assert few["K_data"].size == many["K_data"].size
     assert many["kind"].size == 9 * few["kind"].size
-
-
-def test_a_class_without_kernel_has_its_inverse():
-    """This is the case of eliminated supports, as in FETI-1."""
-    kind = membranes().domains.template(0)
-    n = kind.K.shape[0]
-    K = csc_array(kind.K + eye_array(n))
-    nothing = np.zeros(0, dtype=np.int64)
-    regular = replace(kind, K=K, R=np.zeros((n, 0)), fixing=nothing)
-
-    assert_allclose(regular.inverse(K.toarray()), np.eye(n), atol=1e-13)

@@ -10,7 +10,7 @@ from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.decomposed import decompose, longitudinal_share
-from mortarbench.problems.duality.problem import ElasticBodies, Meshed
+from mortarbench.problems.duality.problem import ElasticBodies, Shape
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
 from mortarbench.problems.feti.subdomains import Contact, TornBodies
@@ -39,7 +39,7 @@ def torn(
     forces = Forces(down, np.full(down.size, -1.0))
     body = np.zeros(len(mesh.cells), dtype=np.int64)
     of = ElasticBodies(
-        shape=Meshed((mesh, body)), names=("box",), materials=(STEEL,),
+        shape=Shape(mesh, body), names=("box",), materials=(STEEL,),
         plane=None, length=1.0, force=STEEL.E, fixed=fixed, forces=forces, pairs=(),
     )  # fmt: skip
     (stage,) = load_steps(1, 1, forces, fixed)

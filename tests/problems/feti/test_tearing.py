@@ -1,20 +1,12 @@
 """Bodies torn into subdomains, and their gluing rows."""
 
-from dataclasses import replace
-from functools import partial
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.sparse import block_diag, csr_array, eye_array
+from scipy.sparse import block_diag, csr_array
 
-from mortarbench.problems.duality.decomposed import elastic_class
-from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.mesh import box_grid, rectangle
-from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomains import (
-    Contact,
-    DecomposedProblem,
     TornBodies,
 )
 from mortarbench.problems.feti.tearing import (
@@ -269,38 +261,3 @@ def test_rows_of_a_tangential_vector_have_equal_scales() -> None:
     assert (tangents[:, 0] == tangents[:, 1]).all()
     assert np.unique(tangents).size > 1
     assert rows.shape[0] == scale.size
-
-
-def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
-    mesh = rectangle((0.0, 0.0), (2.0, 1.0), (4, 2))
-    label, n = blocks((4, 2), 2), mesh.dofs
-    D, E = elasticity_matrix(Material(1.0, 0.3), "strain")[None], np.ones(1)
-    held = 2 * mesh.boundaries["left"]
-    load = np.arange(1.0, n + 1)
-    layout = Subdivision(mesh, label, np.zeros_like(label))
-    problem = DecomposedProblem(
-        layout=layout, components=2, material=np.zeros(2, dtype=np.int64),
-        assemble_class=partial(elastic_class, D=D, E=E), E=E, names=("plate",),
-        load=load, fixed=held, glue="orthonormal",
-        contact=Contact(
-            csr_array(eye_array(n, format="csr")[held[:1]]), np.ones(1), np.zeros(0)
-        ),
-    )  # fmt: skip
-    whole, torn = (
-        TornBodies(one) for one in (problem, replace(problem, eliminated=True))
-    )
-    first, second = map(torn.domains.template, torn.domains.class_of)
-    assert [first.R.shape, second.R.shape] == [(15, 1), (18, 3)]
-    assert abs(first.K @ first.R).max() < 1e-13
-    assert_allclose(first.R.T @ first.R, [[1.0]])
-    assert abs(first.R[first.fixing]).min() > 0.1
-    B, c, equalities = torn.rows
-    assert equalities == whole.rows.equalities - held.size
-    assert B.shape[0] == c.size == equalities + 1  # the contact row
-    u = np.arange(n) ** 0.5
-    u[held] = 0
-    v = whole.spread @ u
-    assert_allclose(torn.spread @ u, v[v != 0])
-    assert_allclose(B @ (torn.spread @ u), 0, atol=1e-12)
-    free = ~np.isin(np.arange(n), held)
-    assert_allclose(torn.spread.T @ torn.f, free * load)
