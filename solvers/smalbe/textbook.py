@@ -591,9 +591,12 @@ def _solve_to_tolerance(
         if worst <= tol:
             return point
         tighter *= min(0.5, max(0.01, tol / worst))
+        if at.ray is not None:
+            message = "a direction of descent has no curvature and no bound"
+            return replace(point, status=Status.FAILED, message=message)
         if at.status is not Status.SOLVED or tighter < MIN_TIGHTENING:
             message = "step limit"
-            if at.ray is not None or at.status is Status.SOLVED:
+            if at.status is Status.SOLVED:
                 message = f"stagnated at residual {worst:.1e} because of rounding"
             return replace(point, status=Status.ITERATION_LIMIT, message=message)
 

@@ -191,7 +191,8 @@ def test_unbounded_qps_are_reported(name, qp):
 
     # without a diagonal of P, the ray is no proof
     s = SOLVERS[name].prepare(replace(qp, P=aslinearoperator(qp.P)), 1e-8)()
-    assert s.status is not Status.SOLVED
+    assert s.status is Status.FAILED
+    assert s.message == "a direction of descent has no curvature and no bound"
 
 
 @pytest.mark.parametrize("name", NAMES)
