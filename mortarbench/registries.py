@@ -50,7 +50,7 @@ Plugins = Annotated[Sequence[str | Path | PluginFile], "--plugin [LABEL=]FILE.py
 
 
 class Reporter(Protocol):
-    """Function that writes the report on a result folder and returns the files."""
+    """Function that writes a report and returns its files and main sentences."""
 
     def __call__(
         self,
@@ -58,7 +58,7 @@ class Reporter(Protocol):
         formats: Sequence[str],
         *,
         factor: float = ...,
-    ) -> list[Path]:
+    ) -> tuple[list[Path], list[str]]:
         """Write the report.
 
         factor : a point is verified if every residual is at most factor·tol
@@ -133,8 +133,8 @@ def reference(qp: QP) -> Solution:
 
 def report_folder(
     folder: Path, formats: Sequence[str], *, factor: float = VERIFIED_FACTOR
-) -> list[Path]:
-    """Write the built-in report on a result folder and return the files."""
+) -> tuple[list[Path], list[str]]:
+    """Write the built-in report on a folder; return its files and main sentences."""
     from mortarbench.reports.folder import write_report
 
     return write_report(folder, formats, factor)

@@ -14,7 +14,7 @@ from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.registries import Registries, load_registries, report_folder
+from mortarbench.registries import Registries, load_registries
 
 if TYPE_CHECKING:
     from mortarbench.reports.compare import Change
@@ -150,13 +150,7 @@ def _report(
 ) -> Report:
     """Write the report of a folder, by the function of the registries."""
     with report_full_disk(folder):
-        files = registries.report(folder, formats, factor=factor)
-    if registries.report is not report_folder:  # the sentences are of the built-in one
-        return Report(files=tuple(files))
-    from mortarbench.reports.folder import sentences
-    from mortarbench.reports.measurements import read_measurements
-
-    said = sentences(read_measurements(folder, factor))
+        files, said = registries.report(folder, formats, factor=factor)
     return Report(files=tuple(files), said=tuple(said))
 
 

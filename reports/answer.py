@@ -7,7 +7,7 @@ error of the row. Otherwise, a solver with a weak stopping test would look fast.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -160,22 +160,24 @@ def fastest(logs: pd.DataFrame) -> str:
     return str((common if len(common) else logs).mean().idxmin())
 
 
-def _logs(df: pd.DataFrame, chosen: pd.DataFrame) -> dict[tuple[str, str], pd.Series]:
-    """Return log times of the chosen answers by (case, solver), indexed by repeat."""
+#: log times by case and solver, then by session and repeat
+Logs = Mapping[tuple[str, str], Mapping[tuple[str, int], float]]
+
+
+def _logs(df: pd.DataFrame, chosen: pd.DataFrame) -> Logs:
+    """Return the log times of the chosen answers."""
     times = df.merge(chosen[KEY], on=KEY)
     times = times[times.total_seconds > 0]
-    return {
-        (str(case), str(solver)): pd.Series(
-            np.log(of.total_seconds.to_numpy()),
-            index=pd.MultiIndex.from_frame(of[["session", "repeat"]]),
-        )
-        for (case, solver), of in times.groupby(["case", "solver"], sort=False)
-    }
+    logs: dict[tuple[str, str], dict[tuple[str, int], float]] = {}
+    columns = ("case", "solver", "session", "repeat")
+    for case, solver, session, repeat, log in zip(
+        *(times[c] for c in columns), np.log(times.total_seconds), strict=True
+    ):
+        logs.setdefault((case, solver), {})[session, repeat] = log
+    return logs
 
 
-def compared(
-    logs: dict[tuple[str, str], pd.Series], first: str, other: str, cases: Sequence[str]
-) -> Pooled:
+def compared(logs: Logs, first: str, other: str, cases: Iterable[str]) -> Pooled:
     """Pool the time of a solver relative to another, paired by session and repeat.
 
     Measurements of one repeat follow each other in time, so that a disturbance that
@@ -184,8 +186,9 @@ def compared(
     differences = []
     for case in cases:
         a, b = logs[case, other], logs[case, first]
-        d = (a - b).dropna() if a.index.is_unique and b.index.is_unique else a[:0]
-        differences.append(d if len(d) else a - b.median())
+        paired = [log - b[key] for key, log in a.items() if key in b]
+        middle = 0.0 if paired else float(np.median([*b.values()]))
+        differences.append(paired or [log - middle for log in a.values()])
     return pooled(differences)
 
 
@@ -193,33 +196,8 @@ def growth_of(answers: pd.DataFrame, size: str = "m") -> PowerLaw | None:
     """Fit time against size, with one factor for each series of equal other keys."""
     known = answers[answers[size] > 0]
     return power_law(
-        [(of[size], of.total_seconds) for _, of in known.groupby(series_of(known))]
+        [(of[size], of.total_seconds) for _, of in known.groupby("series")]
     )
-
-
-def series_of(answers: pd.DataFrame) -> pd.Series:
-    """Return a label of the series of each answer: family and keys that are not sizes.
-
-    A key is not a size if cases of one family with equal n differ in it, such as the
-    load step.
-    """
-    labels = pd.Series("", index=answers.index)
-    for family, of in answers.groupby("family"):
-        params = pd.DataFrame(list(of.params), index=of.index)
-        fixed = [
-            key
-            for key in params
-            if params[key].astype(str).groupby(of.n.fillna(of.m)).nunique().max() > 1
-        ]
-        shown = (
-            params[fixed]
-            .astype(str)
-            .apply(lambda row: "/".join(f"{k}={v}" for k, v in row.items()), axis=1)
-            if fixed
-            else ""
-        )
-        labels[of.index] = family + ("/" if fixed else "") + shown
-    return labels
 
 
 def decisive(found: Sequence[Row]) -> list[Row]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from mortarbench.harness.errors import InputError, unknown
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.reports.answer import decisive, rows, sentence
-from mortarbench.reports.export.records import write_csv, write_parquet
+from mortarbench.reports.export.records import plain, write_csv, write_parquet
 from mortarbench.reports.figures.curves import against
 from mortarbench.reports.measurements import Measurements, read_measurements
 from mortarbench.reports.sections import compose
@@ -23,14 +23,15 @@ FORMATS = ("html", "md", "tex", "csv", "parquet")
 
 def write_report(
     directory: Path, formats: Sequence[str], factor: float = VERIFIED_FACTOR
-) -> list[Path]:
+) -> tuple[list[Path], list[str]]:
     """Write the report of a result folder to `directory`/report.
 
     factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
 
     Returns
     -------
-    paths of the files written
+    paths of the files written, and the sentences of the first screen: one for each
+    form and machine
 
     Raises
     ------
@@ -46,21 +47,19 @@ def write_report(
     written = []
     if {"html", "md", "tex", "csv"} & set(formats):
         written += write_document(compose(run), target, formats)
-    stored = run if factor == VERIFIED_FACTOR else read_measurements(directory)
-    if "csv" in formats:
-        written.append(write_csv(target / "tables" / "measurements.csv", stored.df))
-    if "parquet" in formats:
-        written.append(write_parquet(target / "records.parquet", stored.df))
-    return written
-
-
-def sentences(run: Measurements) -> list[str]:
-    """Return the sentences of the first screen, one for each form and machine."""
-    return [
+    if {"csv", "parquet"} & set(formats):
+        stored = run if factor == VERIFIED_FACTOR else read_measurements(directory)
+        frame = plain(stored.df)
+        if "csv" in formats:
+            written.append(write_csv(target / "tables" / "measurements.csv", frame))
+        if "parquet" in formats:
+            written.append(write_parquet(target / "records.parquet", frame))
+    said = [
         sentence(row)
         for digest in dict.fromkeys(run.df.environment)
         for row in decisive(list(rows(run.only(environment=digest))))
     ]
+    return written, said
 
 
 def plot(run: Measurements, kind: str, x: str | None = None) -> Figure:

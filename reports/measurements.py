@@ -107,7 +107,7 @@ class Measurements:
         answers = grouped.agg(ANSWERS).reset_index()
         answers = answers.rename(columns={"run_id": "repeats"})
         answers["status"] = [SEVERITY[i].value for i in answers.severity]
-        return answers
+        return answers.assign(series=series_of(answers))
 
     def selected(self, solvers: Sequence[str], cases: Sequence[str]) -> Measurements:
         """Return the measurements of some solvers and cases.
@@ -234,6 +234,31 @@ def _united(
         united[digest] = next(same, digest) if environment else digest
         environments.setdefault(united[digest], environment)
     return df.assign(environment=df.environment.map(united)), environments
+
+
+def series_of(answers: pd.DataFrame) -> pd.Series:
+    """Return a label of the series of each answer: family and keys that are not sizes.
+
+    A key is not a size if cases of one family with equal n differ in it, such as the
+    load step.
+    """
+    labels = pd.Series("", index=answers.index)
+    for family, of in answers.groupby("family"):
+        params = pd.DataFrame(list(of.params), index=of.index)
+        fixed = [
+            key
+            for key in params
+            if params[key].astype(str).groupby(of.n.fillna(of.m)).nunique().max() > 1
+        ]
+        shown = (
+            params[fixed]
+            .astype(str)
+            .apply(lambda row: "/".join(f"{k}={v}" for k, v in row.items()), axis=1)
+            if fixed
+            else ""
+        )
+        labels[of.index] = family + ("/" if fixed else "") + shown
+    return labels
 
 
 def in_order(values: Sequence[str], order: Sequence[str]) -> list[str]:

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mortarbench.harness.files.csvfile import safe
-from mortarbench.harness.files.durable import replace_file, replacing
+from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.results.frame import with_texts
 
 #: Parquet types by type of the column; all other columns are text
@@ -22,15 +22,22 @@ _TYPES = {
 }
 
 
-def write_parquet(path: Path, df: pd.DataFrame) -> Path:
-    """Write the measurements of a report, with one more column for each key of a case.
+def plain(df: pd.DataFrame) -> pd.DataFrame:
+    """Return the measurements with columns of numbers and texts only.
+
+    There is one more column for each key of a case. Nested values (params, options,
+    counts, quantities, …) are JSON text, since they differ between families and
+    solvers.
+    """
+    return with_texts(with_keys(df))
+
+
+def write_parquet(path: Path, frame: pd.DataFrame) -> Path:
+    """Write a frame of `plain`.
 
     The types of columns do not depend on values, so that tables of several result
-    folders can be concatenated. Nested values (params, options, counts, quantities, …)
-    are JSON text, since they differ between families and solvers. Equal frames yield
-    identical bytes.
+    folders can be concatenated. Equal frames yield identical bytes.
     """
-    frame = with_texts(with_keys(df))
     table = pa.table(
         {
             name: pa.array(
@@ -45,14 +52,13 @@ def write_parquet(path: Path, df: pd.DataFrame) -> Path:
     return path
 
 
-def write_csv(path: Path, df: pd.DataFrame) -> Path:
-    """Write the same columns as CSV that is safe to open in spreadsheets."""
-    frame = with_texts(with_keys(df))
+def write_csv(path: Path, frame: pd.DataFrame) -> Path:
+    """Write a frame of `plain` as CSV that is safe to open in spreadsheets."""
     texts = frame.loc[:, [str(t) not in _TYPES for t in frame.dtypes]]
-    frame = frame.assign(**texts.map(safe, na_action="ignore"))
-    frame = frame.rename(columns=safe)
+    frame = frame.assign(**texts.map(safe, na_action="ignore")).rename(columns=safe)
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, frame.to_csv(index=False, lineterminator="\n").encode())
+    with replacing(path) as file:
+        frame.to_csv(file, index=False, lineterminator="\n", chunksize=1000)
     return path
 
 

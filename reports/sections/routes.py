@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from mortarbench.reports.answer import Row, fastest, series_of
+from mortarbench.reports.answer import Row, fastest
 from mortarbench.reports.document import (
     Item,
     Picture,
@@ -23,7 +23,7 @@ from mortarbench.reports.document import (
 )
 from mortarbench.reports.figures import curves
 from mortarbench.reports.intervals import Pooled, pooled
-from mortarbench.reports.measurements import Measurements, in_order
+from mortarbench.reports.measurements import Measurements, in_order, series_of
 from mortarbench.reports.sections.solvers import tightest
 
 MULTIGRID = "ipm-amg"  #: solver whose use of the primal form is a route of its own

@@ -15,7 +15,7 @@ from mortarbench.harness import InputError, Verdict
 from mortarbench.harness.files.store import load_history
 from mortarbench.harness.record import PROVEN, REFUTED
 from mortarbench.harness.solution import History
-from mortarbench.reports.answer import Row, growth_of, series_of, with_errors
+from mortarbench.reports.answer import Row, growth_of, with_errors
 from mortarbench.reports.document import (
     ABSENT,
     Item,
@@ -32,7 +32,7 @@ from mortarbench.reports.document import (
 )
 from mortarbench.reports.figures import curves
 from mortarbench.reports.intervals import median_interval, power_law
-from mortarbench.reports.measurements import CELL, Measurements
+from mortarbench.reports.measurements import CELL, Measurements, series_of
 
 GROUPS = {
     "verified": (Verdict.VERIFIED, *PROVEN),
@@ -250,12 +250,14 @@ def _condition(run: Measurements) -> Iterator[Item]:
     )
     x = "feti" if answers.feti.nunique() > 2 else "n"
     kept = answers if x == "n" else answers[answers.feti > 0]
-    labels = series_of(kept)
+    kept = kept.assign(series=series_of(kept))
     yield Picture(
         name="kappa",
         caption="Condition numbers that the cases report, against "
         + ("the degrees of freedom." if x == "n" else "H/h, cells along a subdomain."),
-        draw=partial(curves.condition, kept.assign(series=labels), x, list(names)),
+        draw=partial(
+            curves.condition, kept.assign(series=series_of(kept)), x, list(names)
+        ),
     )
 
 
@@ -272,7 +274,7 @@ def iterations(run: Measurements, rows: list[Row]) -> Iterator[Item]:
                 [
                     (o.m, o.iterations)
                     for _, o in mine[(mine.iterations > 0) & (mine.m > 0)].groupby(
-                        series_of(mine)
+                        "series"
                     )
                 ]
             )

@@ -28,7 +28,7 @@ FAMILIES = load_plugin(TOY_PROBLEM).problems
 
 def report(folder, formats, *, factor=10.0):
     name = "index" if factor == 10 else f"index-{factor:g}"
-    return [folder / f"{name}.{f}" for f in formats]
+    return [folder / f"{name}.{f}" for f in formats], []
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ def cli(capsys, monkeypatch, tmp_path):
     nothing = {}
     registries = Registries(
         families=toy.problems, solvers=toy.solvers,
-        report=lambda *_, **__: [],
+        report=lambda *_, **__: ([], []),
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         reference=unsolved, **nothing,
     )  # fmt: skip

@@ -144,7 +144,7 @@ def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda *_, **__: [],
+        report=lambda *_, **__: ([], []),
     )  # fmt: skip
     (tmp_path / "s.toml").write_text(
         'name = "s"\ntolerances = [1e-3, 1e-8]\nrepeats = 1\ntime_limit = 60\n'

@@ -60,7 +60,7 @@ def cli(capsys, monkeypatch, tmp_path):
         families=TOY.problems,
         solvers=TOY.solvers,
         reference=lambda qp: TOY.solvers["exact"].prepare(qp, 0.0)(),
-        report=lambda *_, **__: [],
+        report=lambda *_, **__: ([], []),
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
     )
 

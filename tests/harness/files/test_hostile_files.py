@@ -55,7 +55,7 @@ def command(capsys):
     """Run the command line; return exit code, stdout and stderr."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda *_, **__: [],
+        report=lambda *_, **__: ([], []),
 
     )  # fmt: skip
 

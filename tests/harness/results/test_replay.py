@@ -35,7 +35,7 @@ params = { depth = [1, 2] }
 
 
 def no_report(folder, formats, *, factor=10.0):
-    return []
+    return [], []
 
 
 @pytest.fixture(scope="module")

@@ -114,7 +114,7 @@ def cli(capsys, monkeypatch, tmp_path):
     registries = Registries(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
-        report=lambda *_, **__: [],
+        report=lambda *_, **__: ([], []),
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         **nothing,
     )
@@ -327,7 +327,7 @@ def start(*arguments, **how):
         "nothing = {'reference': None}; "
         "sys.exit(main(Registries(families=toy_problem.PROBLEMS, "
         "solvers=toy_problem.SOLVERS, "
-        "report=lambda *_, **__: [], **nothing, "
+        "report=lambda *_, **__: ([], []), **nothing, "
         "start=(sys.executable, '-P', toy_problem.__file__)), sys.argv[2:]))"
     )
     command = [sys.executable, "-c", program, str(TOY_PROBLEM.parent)]

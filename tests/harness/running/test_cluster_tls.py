@@ -80,7 +80,7 @@ def test_a_suite_is_measured_over_tls_with_dask_s_own_configuration(
     registries = Registries(
         families=plugin.problems,
         solvers=plugin.solvers,
-        report=lambda *_, **__: [],
+        report=lambda *_, **__: ([], []),
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         **nothing,
     )

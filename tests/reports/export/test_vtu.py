@@ -265,7 +265,7 @@ def solve(tmp_path, capsys):
     """Solve a case with --vtu; return exit code, stderr and the file."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda *_, **__: [],
+        report=lambda *_, **__: ([], []),
 
     )  # fmt: skip
 
