@@ -86,7 +86,7 @@ def test_the_value_of_the_user_replaces_a_tolerance_of_the_adapter(qp):
     ("name", "options", "message"),
     [
         ("clarabel", {"max_step_fractoin": 1}, "did you mean 'max_step_fraction'?"),
-        ("clarabel", {"max_step_fraction": "a"}, "is of type str; expected float"),
+        ("clarabel", {"max_step_fraction": "a"}, "expected a number"),
         ("clarabel", {"equilibrate_max_iter": -1}, "equilibrate_max_iter = -1: "),
         ("piqp", {"kkt_solver": "qr"}, "expected one of dense_cholesky, sparse_ldlt"),
         ("scs", {"nonsense": 1}, "'nonsense' is an invalid keyword"),
