@@ -71,6 +71,12 @@ cdef enum:
 cdef double SUFFICIENT_DECREASE = 1e-4
 
 
+# If the step to the boundary is longer than this fraction of the CG step, the expansion
+# consists of this step alone. Without this constant and SPECTRAL_GAMMA, Mindlin's
+# problem with 1468 discs, ν = 0.3, takes 100 instead of 71 products.
+cdef double LONG_STEP = 0.5
+
+
 # Two components or discs count as reaching the boundary at the same time if their step
 # lengths differ by at most this fraction. A step to the boundary is longer by this
 # fraction, so that both reach the boundary. In symmetric problems, such as greco/dim=3,
@@ -89,6 +95,9 @@ cdef double NEWTON_ACCURACY = 0.01
 # subdomains with ratio=100 and distort=0.25 takes 7692 products instead of 575. Values
 # from 1e2 to 1e6 lead to similar numbers of products.
 cdef double MIN_PROJECTING = 1e4
+
+# Factor of Γ² for spectral steps, which act on φ and β at the same time
+cdef double SPECTRAL_GAMMA = 0.1
 
 EXPANSIONS = {
     "std": STD, "mixed": MIXED, "model": MODEL, "spectral": SPECTRAL,
@@ -899,13 +908,13 @@ cdef class MPRGP:
         return b"f" if self.expansion in (MIXED, OWN) else b"e"
 
     cdef int expand_spectrally(self) except -1:
-        """Step to the boundary; a spectral step may follow (`spectral_step_leaves`)."""
-        cdef double feasible = (1 + TIE) * self.line.feasible
+        """Step to the boundary; add a spectral step unless the step is long enough."""
+        cdef double feasible = (1 + TIE) * self.line.feasible, cg = self.line.cg
         if self.line.curvature > NOISE * self.line.slope:
             self.spectral_length = rounded(self.square_of_p() / self.line.curvature)
         self.record_cost(change_along(&self.line, feasible))
         self.to(feasible, self.p, self.Hp, False)
-        return 1
+        return feasible > LONG_STEP * cg or self.step_spectrally()
 
     cdef int trial_of_rule(self, double *y) except -1:
         """y ← Π(x_trial − x̃) with the trial point x_trial of a subclass's step rule.

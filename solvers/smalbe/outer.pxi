@@ -83,6 +83,8 @@ cdef class SMALBE(MPRGP):
             self.diagonal = read(problem.diagonal, self.owners)
         self.alpha, self.Gamma_square = options.alpha, options.Gamma
         self.Gamma_square *= self.Gamma_square
+        if options.expansion == "spectral":
+            self.Gamma_square *= SPECTRAL_GAMMA
         self.reduced = options.reduced
         self.expansion = EXPANSIONS[options.expansion]
         self.step_rule = step_rule
