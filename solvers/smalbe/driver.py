@@ -31,7 +31,6 @@ from mortarbench.solvers.smalbe.projected import (
     Projected,
     Spectrum,
     by_lanczos,
-    by_power,
     projected_problem,
     times_projected,
 )
@@ -266,8 +265,6 @@ def _estimated_spectrum(
     two. The reuse is permitted only with model steps, because model steps detect and
     correct a wrong model.
     """
-    if options.norm == "power":
-        return by_power(F, C)
     if carry is not None and options.expansion == "model":
         previous, rows = carry.spectrum.ritz, C.source
         v = rows.project(random_start(rows.x_tilde.size))

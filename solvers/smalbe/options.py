@@ -15,8 +15,7 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 #: Rule of the expansion step. The origin of a rule and its number of products with F
 #: are in brackets.
 #: std: the CG step, shortened to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
-#: projcg: x ← Π(x − α_cg p), even if the cost rises (PERMON; 2)
-#: mixed: projcg, or std if projcg would increase the cost (ESPRESO; 2 or 3)
+#: mixed: x ← Π(x − α_cg p), or std if this would increase the cost (ESPRESO; 2 or 3)
 #: model: the CG point, projected in the metric of the model (new; 2, or 1 if the step
 #: to the boundary is the whole step; 1 more per CG step beyond the box, and 1 more if
 #: the decrease is below the decrease of gradient projection)
@@ -25,7 +24,7 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 #: Barzilai-Borwein steps also replace every proportioning step, and CG if the first CG
 #: step would leave the set (1). With discs, the value model selects spectral, because
 #: the model is minimised only over boxes
-Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
+Expansion = Literal["std", "mixed", "model", "spectral"]
 #: Rule of the proportioning step, which usually takes 1 product.
 #: cg: minimise along −β as far as feasible (textbook). With discs, −β is not a feasible
 #: direction, so the rule model is used instead
@@ -34,7 +33,6 @@ Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
 #: that did not halve ‖β‖²
 Proportioning = Literal["cg", "model"]
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
-Norm = Literal["lanczos", "power"]
 Eliminate = Literal["never", "sequences", "always"]
 
 
@@ -59,7 +57,6 @@ class Options:
     )
     reduced: bool = True  #: proportion if ‖β‖² > Γ²φ̃ᵀφ; False: if ‖β‖² > Γ²φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
-    norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
     # n/10 is the limit without equality rows
     lanczos_steps: int = 12  #: limit of Lanczos steps; at most n/6 or n/10, at least 5
     # only with the preconditioners model and none; others require the original P
@@ -88,7 +85,6 @@ class Options:
             "expansion": EXPANSIONS,
             "proportioning": PROPORTIONINGS,
             "preconditioner": PRECONDITIONERS,
-            "norm": get_args(Norm),
             "eliminate": get_args(Eliminate),
         }
         for name, known in choices.items():
@@ -97,13 +93,6 @@ class Options:
             raise ValueError(
                 "preconditioner = 'incomplete' works in scaled variables, which the "
                 "functions of a subclass do not expect; expected another one"
-            )
-        model = self.expansion == "model" or self.preconditioner in ("auto", "model")
-        if self.norm == "power" and model:
-            raise ValueError(
-                "norm = 'power' computes no Ritz vectors; expected 'lanczos', or an "
-                "expansion other than 'model' and a preconditioner other than 'auto' "
-                "and 'model'"
             )
 
     def preconditioner_for(self, qp: QP) -> Operator | None:

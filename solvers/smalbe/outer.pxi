@@ -83,9 +83,9 @@ cdef class SMALBE(MPRGP):
             self.diagonal = read(problem.diagonal, self.owners)
         self.alpha, self.Gamma_square = options.alpha, options.Gamma
         self.Gamma_square *= self.Gamma_square
-        self.reduced = options.reduced
         if options.expansion == "spectral":
             self.Gamma_square *= SPECTRAL_GAMMA
+        self.reduced = options.reduced
         self.expansion = EXPANSIONS[options.expansion]
         self.step_rule = step_rule
         if step_rule is not None:

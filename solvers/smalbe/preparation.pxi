@@ -92,14 +92,7 @@ def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
     return result
 
 
-# A spectrum counts as flat if the ratio of the largest to the smallest Ritz value after
-# FLAT_STEPS steps is at most FLAT_RATIO. With the condition number 10, CG about halves
-# its error in every step, and further products of the Lanczos process would cost more
-# than they save.
-cdef double FLAT_RATIO = 10.0
-
 cdef enum:
-    FLAT_STEPS = 5
     # largest number of QR steps per eigenvalue; convergence is cubic, and two steps
     # usually suffice
     QR_STEPS = 30
@@ -172,28 +165,6 @@ cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept 
         diagonal[i] *= most
 
 
-cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
-    """Return True if the ratio of the Ritz values of FLAT_STEPS steps is ≤ FLAT_RATIO.
-
-    The diagonal entries are Rayleigh quotients, which lie between the smallest and the
-    largest Ritz value. The ratio of these entries is therefore a cheap first test.
-    """
-    cdef double theta[FLAT_STEPS]
-    cdef double between[FLAT_STEPS]
-    cdef double vectors[FLAT_STEPS * FLAT_STEPS]
-    cdef double least = diagonal[0], largest = diagonal[0]
-    cdef int i
-    for i in range(1, FLAT_STEPS):
-        least = diagonal[i] if diagonal[i] < least else least
-        largest = diagonal[i] if diagonal[i] > largest else largest
-    if least < largest / FLAT_RATIO:
-        return False
-    memcpy(theta, diagonal, FLAT_STEPS * sizeof(double))
-    memcpy(between, off, FLAT_STEPS * sizeof(double))
-    diagonalise(theta, between, vectors, FLAT_STEPS)
-    return theta[0] >= theta[FLAT_STEPS - 1] / FLAT_RATIO
-
-
 def eigenpairs(diagonal, off):
     """Return ascending eigenvalues (k,) and eigenvectors (k, k), as rows, of a matrix.
 
@@ -212,9 +183,7 @@ def lanczos(Product F, Rows C, start, int steps):
     The Lanczos process with full reorthogonalisation takes one product per step, and at
     most rank(𝒫) steps. After the three-term recurrence, the norm of the vector is
     already close to the next β, so one pass of reorthogonalisation suffices. The
-    residual of the pair (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The
-    process ends after FLAT_STEPS steps if the spectrum `is_flat`, because CG then needs
-    few steps and no model. If the first pair has not converged, no vectors are
+    residual of the pair (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. If the first pair has not converged, no vectors are
     returned, because no model would use them.
 
     C : rows that span the kernel of 𝒫
@@ -258,8 +227,6 @@ def lanczos(Product F, Rows C, start, int steps):
         off[k] = beta
         kept = k + 1
         if beta <= 1e-12 * largest:
-            break
-        if kept == FLAT_STEPS and is_flat(diagonal, off):
             break
     if not kept:
         return zeros(1), zeros(1), np.zeros((1, n)), 0.0

@@ -23,7 +23,7 @@ from mortarbench.solvers.smalbe.rows import (
     is_sparse,
     orthonormal_rows,
 )
-from mortarbench.solvers.smalbe.spectrum import Ritz, power_method, random_start
+from mortarbench.solvers.smalbe.spectrum import Ritz, random_start
 
 
 class Spectrum(NamedTuple):
@@ -111,7 +111,7 @@ def projected_problem(
 
     If x̃ ≠ 0, this takes one product in addition to the products of `find`.
 
-    find : function that returns the spectrum of 𝒫F𝒫, such as `by_lanczos` or `by_power`
+    find : function that returns the spectrum of 𝒫F𝒫, such as `by_lanczos`
     """
     F = Product(qp.P, qp.q.size)
     discs = tuple(one for one in qp.sets if isinstance(one, Discs))
@@ -160,13 +160,6 @@ def by_lanczos(
     start = random_start(C.n) if start is None else start
     ritz = Ritz(*compiled.lanczos(F, C, start, steps))
     return Spectrum(ritz.norm or 1.0, ritz)
-
-
-def by_power(F: Product, C: compiled.Rows) -> Spectrum:
-    """Estimate the norm by PERMON's power method, with at most 50 products."""
-    rows = C.source
-    norm = power_method(partial(times_projected, F, rows), rows.x_tilde.size)
-    return Spectrum(norm or 1.0, None)
 
 
 def times_projected(F: Product, rows: Rows, v: Vector) -> Vector:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -34,22 +33,3 @@ def random_start(n: int) -> Vector:
     start = np.random.default_rng(19640229).standard_normal(n)
     start.flags.writeable = False
     return start
-
-
-def power_method(H: Callable[[Vector], Vector], n: int) -> float:
-    """Estimate ‖H‖ by PERMON's power method, with at most 50 products.
-
-    The iteration starts from a vector of ones and ends when a step changes the Rayleigh
-    quotient by less than 1e-4, relative to the quotient. The last Rayleigh quotient is
-    a lower bound on ‖H‖ and is used without a safety factor, as in PERMON.
-    """
-    v = np.full(n, 1 / np.sqrt(n))
-    estimate = 0.0
-    for _ in range(50):
-        Hv = H(v)
-        before, estimate = estimate, float(v @ Hv)
-        size = float(np.linalg.norm(Hv))
-        if size == 0 or abs(estimate - before) < 1e-4 * abs(estimate):
-            break
-        v = Hv / size
-    return estimate
