@@ -183,13 +183,14 @@ def compared(logs: Logs, first: str, other: str, cases: Iterable[str]) -> Pooled
     Measurements of one repeat follow each other in time, so that a disturbance that
     affects both cancels. Without common repeats, the median of `first` is used.
     """
-    differences = []
+    differences, sessions = [], set()
     for case in cases:
         a, b = logs[case, other], logs[case, first]
+        sessions |= {session for session, _ in a}
         paired = [log - b[key] for key, log in a.items() if key in b]
         middle = 0.0 if paired else float(np.median([*b.values()]))
         differences.append(paired or [log - middle for log in a.values()])
-    return pooled(differences)
+    return pooled(differences, len(sessions))
 
 
 def growth_of(answers: pd.DataFrame, size: str = "m") -> PowerLaw | None:

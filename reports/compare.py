@@ -5,7 +5,8 @@ its times after and before is taken over the cells that were verified both times
 cells are fixed; the error of the mean is due to the noise of the repeats, and its
 interval is Welch's [1]_: the squared errors of the cells add, with the degrees of
 freedom of Satterthwaite. Repeats of one run are paired, since the solvers of a repeat
-follow each other; repeats of two runs are not.
+follow each other; repeats of two runs are not. The error of the processes, which the
+repeats of a run share, is added (`reports.intervals`).
 
 References
 ----------
@@ -25,7 +26,7 @@ import numpy as np
 import pandas as pd
 
 from mortarbench.reports.document import interval, number, plural
-from mortarbench.reports.intervals import Array, Interval, student
+from mortarbench.reports.intervals import Array, Interval, student, widened
 from mortarbench.reports.measurements import CELL, SEVERITY, Measurements
 
 MOST_REPEATS = 10_000  #: largest number of repeats that is recommended
@@ -62,6 +63,7 @@ class Change:
     other_machine: bool  #: True if common cells have times, but of other machines
     cells: int  #: number of cells with a ratio
     repeats: float  #: mean number of repeats of these cells
+    sessions: int  #: number of sessions after, at most that before
     by_cell: pd.DataFrame  #: ratio of each cell, from the largest
     #: cells whose status changed, with the statuses `old` and `new`
     statuses: pd.DataFrame
@@ -101,11 +103,15 @@ class Change:
         if not self.ratio.is_known:
             return "a single repeat has no interval; use --repeats 7"
         half = float(np.log(self.ratio.high / self.ratio.value))
+        least = f"the smallest detectable factor here is {number(float(np.exp(half)))}"
+        process = widened(0.0, self.sessions)
+        if half**2 < 2 * process**2:  # more repeats in these processes would not help
+            runs = int(np.ceil(2 * self.sessions * (process / np.log(limit)) ** 2))
+            return f"{least}; merge {max(runs, 2 * self.sessions)} runs"
         needed = self.repeats * (half / np.log(limit)) ** 2
         # the mean itself may be close to the limit
         more = int(min(np.ceil(max(needed, 2 * self.repeats)), MOST_REPEATS))
-        least = number(float(np.exp(half)))
-        return f"the smallest detectable factor here is {least}; use --repeats {more}"
+        return f"{least}; use --repeats {more}"
 
 
 def compare(
@@ -145,7 +151,11 @@ def _change(
         for key in x
         if key in y and key[1:] in cells
     }
-    mean = mean_ratio(list(ratios.values()))
+    sessions = min(
+        len({session for key in ratios for session, _ in logs[key].index})
+        for logs in (x, y)
+    )
+    mean = mean_ratio(list(ratios.values()), sessions)
     by_cell = pd.DataFrame(
         [(*key, np.exp(r.mean), r.repeats) for (_, *key), r in ratios.items()],
         columns=[*CELL, "ratio", "repeats"],
@@ -156,6 +166,7 @@ def _change(
         ratio=mean,
         cells=len(ratios),
         repeats=float(by_cell.repeats.mean()) if ratios else 0.0,
+        sessions=sessions,
         other_machine=bool(cells) and not ratios,
         by_cell=by_cell,
         statuses=statuses,
@@ -222,7 +233,7 @@ def welch(x: Array, y: Array) -> CellRatio:
     return CellRatio(mean, float(square), float(freedom), min(x.size, y.size))
 
 
-def mean_ratio(ratios: Sequence[CellRatio]) -> Interval | None:
+def mean_ratio(ratios: Sequence[CellRatio], sessions: int) -> Interval | None:
     """Return the geometric mean over cells; without an interval for single repeats."""
     if not ratios:
         return None
@@ -232,6 +243,6 @@ def mean_ratio(ratios: Sequence[CellRatio]) -> Interval | None:
     if np.isfinite(square):
         parts = squares**2 / [max(r.freedom, 1.0) for r in ratios]
         freedom = square**2 / parts.sum() if square > 0 else 1.0
-        half = student(float(freedom)) * np.sqrt(square)
+        half = widened(student(float(freedom)) * float(np.sqrt(square)), sessions)
     low, value, high = np.exp(mean + np.array([-half, 0.0, half]))
     return Interval(float(value), float(low), float(high))

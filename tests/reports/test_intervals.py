@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from mortarbench.reports.intervals import (
+    PROCESS,
     median_interval,
     pooled,
     power_law,
-    share,
     student,
+    widened,
 )
 
 
@@ -16,10 +17,14 @@ from mortarbench.reports.intervals import (
 @pytest.mark.parametrize("repeats", [3, 9])
 @pytest.mark.parametrize("scatter", [0.0, 0.3])
 def test_pooled_intervals_contain_the_planted_ratio(cases, repeats, scatter):
-    """Noise differs between cases, and a tenth of the repeats is disturbed."""
+    """Noise differs between cases, and a tenth of the repeats is disturbed.
+
+    Each of the two processes has a factor that all of its repeats share.
+    """
     rng, found, trials = np.random.default_rng(cases * repeats), 0, 1500
     for _ in range(trials):
-        middle = np.log(2) + scatter * rng.standard_normal(cases)
+        processes = PROCESS * (rng.standard_normal(2) @ [1, -1])
+        middle = np.log(2) + processes + scatter * rng.standard_normal(cases)
         noise = 0.05 * rng.lognormal(0, 0.3, (cases, 1))
         logs = middle[:, None] + noise * rng.standard_normal((cases, repeats))
         disturbed = rng.random(logs.shape) < 0.1
@@ -32,8 +37,14 @@ def test_pooled_intervals_contain_the_planted_ratio(cases, repeats, scatter):
 def test_a_single_case_has_an_interval_from_three_repeats_on():
     assert not pooled([[0.1, 0.2]]).ratio.is_known
     three = pooled([[0.1, 0.2, 0.3]]).ratio
-    half = student(2) * 0.1 / np.sqrt(3)
-    assert np.allclose(np.log(three), [0.2, 0.2 - half, 0.2 + half])
+    half = np.hypot(student(2) * 0.1 / np.sqrt(3), 1.96 * np.sqrt(2) * PROCESS)
+    assert np.allclose(np.log(three), [0.2, 0.2 - half, 0.2 + half], atol=1e-5)
+
+
+def test_sessions_reduce_the_error_of_processes_and_repeats_do_not():
+    assert widened(0.0, 4) == pytest.approx(widened(0.0, 1) / 2)
+    many = pooled([np.zeros(100)]).ratio
+    assert np.log(many.high) == pytest.approx(widened(0.0, 1))
 
 
 def test_more_repeats_separate_smaller_factors_unless_cases_differ():
@@ -65,9 +76,3 @@ def test_the_interval_of_an_exponent_covers():
         p = power_law([(x, x**1.2 * noise[0]), (x, 5 * x**1.2 * noise[1])]).exponent
         found += p.low <= 1.2 <= p.high
     assert 0.93 <= found / 1000 <= 0.97
-
-
-def test_shares_have_the_exact_binomial_interval():
-    """With 0 of n, the upper end p solves (1 − p)ⁿ = 0.025."""
-    assert share(0, 10).high == pytest.approx(1 - 0.025**0.1)
-    assert share(10, 10).low == pytest.approx(0.025**0.1)
