@@ -178,15 +178,13 @@ def _with_second_attempt(
 def _on_discs(qp: QP, options: Options) -> Options:
     """Replace options that are not valid for QPs with discs.
 
-    The model of H can be minimised only over boxes. A step along −β, which is tangent
-    to the boundary of a disc, would leave the disc.
+    The model of H can be minimised only over boxes.
     """
     kind = resolved_preconditioner(qp, options.preconditioner)
     return replace(
         options,
         rho=options.rho or RHO_ON_DISCS,
-        expansion="spectral" if options.expansion == "model" else options.expansion,
-        proportioning="model",
+        expansion="spectral",
         preconditioner="none" if kind == "model" else kind,
     )
 

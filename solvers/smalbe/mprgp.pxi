@@ -39,11 +39,9 @@ cdef enum:
     # products instead of 186, and a journal bearing with n = 600 takes 318 instead of
     # 274.
     BEYOND = 8
-    STD = 0
-    MIXED = 2
-    MODEL = 3
-    OWN = 4
-    SPECTRAL = 5
+    MODEL = 0
+    SPECTRAL = 1
+    OWN = 2
     # Number of previous costs with which the nonmonotone line search compares. In a
     # prototype, Mindlin's problem with 88 to 1468 discs takes as many products with 10
     # and with 40 as with 20, 2 % more with 5, and 35 % more with 1 (a monotone search).
@@ -98,11 +96,6 @@ cdef double MIN_PROJECTING = 1e4
 
 # Factor of Γ² for spectral steps, which act on φ and β at the same time
 cdef double SPECTRAL_GAMMA = 0.1
-
-EXPANSIONS = {
-    "std": STD, "mixed": MIXED, "model": MODEL, "spectral": SPECTRAL,
-}
-
 
 cdef double rounded(double length) noexcept:
     """Return a positive length rounded to LENGTH_BITS bits."""
@@ -212,9 +205,9 @@ cdef class MPRGP:
       conjugate to all stored `Directions` of the face, not only to the last direction
     * b, beyond: take a CG step on the face without its bounds, to prepare an expansion
     * e, expansion: expand the active set by one of the rules of
-      `solvers.smalbe.options`
+      `solvers.smalbe.options`, or by the rule of a subclass
     * f, fallback: take a safe expansion step after an expansion with too small a
-      decrease
+      decrease; after a rule of a subclass, this is the standard expansion of the book
     * p, proportioning: release components, by the model, along −β or by a spectral step
     * n, Newton: minimise on the tangents of discs, as described below
 
@@ -250,7 +243,6 @@ cdef class MPRGP:
     cdef FeasibleSet face_set  # feasible set of the step that follows a half step
     cdef double inverse_norm, rho
     cdef double alpha, Gamma_square
-    cdef bint reduced, proportions_by_model
     cdef int expansion
     # CG passes over memory twice, and on sets with discs once more for an F that is not
     # sparse; φ and `free` are not stored
@@ -345,7 +337,7 @@ cdef class MPRGP:
         cdef int letter
         cdef bint has_expanded = False, begun = True
         cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
-        cdef double weight, began, gamma = 0.0  # γ of the deferred update p ← φ − γp
+        cdef double began, gamma = 0.0  # γ of the deferred update p ← φ − γp
         self.in_two = not self.rows.exist and not self.is_preconditioned() and (
             self.set.has_discs
             or (self.F.rows.data != NULL and self.expansion != SPECTRAL)
@@ -382,16 +374,12 @@ cdef class MPRGP:
                 if self.step_by_newton(most, trace):
                     self.record_step(b"n", trace, note)
                 continue
-            weight = self.parts.reduced_square if self.reduced else self.parts.phi_square
-            if self.parts.beta_square > self.Gamma_square * weight:
+            if self.parts.beta_square > self.Gamma_square * self.parts.reduced_square:
                 # 3. Proportioning, because releasing components promises a larger
                 # decrease than a step on the face.
                 idle = idle + 1 if self.parts.beta_square > chopped / 2 else 0
                 chopped = self.parts.beta_square
-                letter = self.proportion(
-                    self.proportions_by_model
-                    and (idle < MAX_IDLE or self.B.basis is None)
-                )
+                letter = self.proportion(idle < MAX_IDLE or self.B.basis is None)
             elif not inside and self.spectral_step_leaves(begun):
                 letter = b"e" if self.step_spectrally() else 0
             else:
@@ -878,34 +866,27 @@ cdef class MPRGP:
         most, enough : see `minimise_beyond`
         """
         cdef Py_ssize_t n = self.n
-        cdef double cg = self.line.cg
+        cdef double required  # twice the decrease of the cost that x2 must attain
         self.knows_Cx = False
-        cdef double required = 0.0  # twice the decrease of the cost that x2 must attain
-        cdef bint has_trial = self.expansion == OWN
-        if has_trial:
-            self.trial_of_rule(self.x2)
-            # 2 φ̃ᵀφ/(2‖H‖), because B = τI with τ = ‖H‖/`alpha` here
-            required = self.parts.reduced_square / (self.alpha * self.B.tau)
-        elif self.expansion == MIXED and isfinite(cg):
-            has_trial = True
-            self.set.project(self.x, cg, self.p, self.x2)
-        if has_trial:
-            self.gradient(self.x2, self.g2)
-            if self.cost(self.x2, self.g2) <= self.cost(self.x, self.g) - required:
-                memcpy(self.x, self.x2, n * sizeof(double))
-                memcpy(self.g, self.g2, n * sizeof(double))
-                self.split()
-                return b"e"
         if self.expansion == MODEL:
             return self.expand_by_model(is_first, most, enough, trace)
         if self.expansion == SPECTRAL:
             return b"e" if self.expand_spectrally() else 0
+        self.trial_of_rule(self.x2)
+        # 2 φ̃ᵀφ/(2‖H‖), because B = τI with τ = ‖H‖/`alpha` here
+        required = self.parts.reduced_square / (self.alpha * self.B.tau)
+        self.gradient(self.x2, self.g2)
+        if self.cost(self.x2, self.g2) <= self.cost(self.x, self.g) - required:
+            memcpy(self.x, self.x2, n * sizeof(double))
+            memcpy(self.g, self.g2, n * sizeof(double))
+            self.split()
+            return b"e"
         self.to(self.line.feasible, self.p, self.Hp)
         self.set.project_free(self.x, self.g, self.B.tau, self.x2)
         memcpy(self.x, self.x2, n * sizeof(double))
         self.gradient(self.x, self.g)
         self.split()
-        return b"f" if self.expansion in (MIXED, OWN) else b"e"
+        return b"f"
 
     cdef int expand_spectrally(self) except -1:
         """Step to the boundary; add a spectral step unless the step is long enough."""

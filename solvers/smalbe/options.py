@@ -12,27 +12,16 @@ from mortarbench.solvers.common.conversion import check_choice, check_positive
 from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
-#: Rule of the expansion step. The origin of a rule and its number of products with F
-#: are in brackets.
-#: std: the CG step, shortened to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
-#: mixed: x ← Π(x − α_cg p), or std if this would increase the cost (ESPRESO; 2 or 3)
-#: model: the CG point, projected in the metric of the model (new; 2, or 1 if the step
-#: to the boundary is the whole step; 1 more per CG step beyond the box, and 1 more if
-#: the decrease is below the decrease of gradient projection)
+#: Rule of the expansion step. The number of products with F is in brackets.
+#: model: the CG point, projected in the metric of the model (2, or 1 if the step to the
+#: boundary is the whole step; 1 more per CG step beyond the box, and 1 more if the
+#: decrease is below the decrease of gradient projection)
 #: spectral: a step to the boundary and, unless this step is most of the CG step, a
 #: projected Barzilai-Borwein step with a nonmonotone line search (1 or 2).
 #: Barzilai-Borwein steps also replace every proportioning step, and CG if the first CG
 #: step would leave the set (1). With discs, the value model selects spectral, because
 #: the model is minimised only over boxes
-Expansion = Literal["std", "mixed", "model", "spectral"]
-#: Rule of the proportioning step, which usually takes 1 product.
-#: cg: minimise along −β as far as feasible (textbook). With discs, −β is not a feasible
-#: direction, so the rule model is used instead
-#: model: minimise the model over the box; for the model B = I/ᾱ this is a projected
-#: gradient step. Unless B = τI, a step of the rule cg follows after two model steps
-#: that did not halve ‖β‖²
-Proportioning = Literal["cg", "model"]
-EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
+Expansion = Literal["model", "spectral"]
 Eliminate = Literal["never", "sequences", "always"]
 
 
@@ -41,21 +30,18 @@ class Options:
     """Options of SMALBE."""
 
     expansion: Expansion = "model"  #: see `solvers.smalbe.options`
-    proportioning: Proportioning = "model"
     preconditioner: Preconditioner = "auto"  #: see `solvers.smalbe.preconditioner`
     #: penalty ρ, relative to ‖𝒫F𝒫‖; 0 selects 1 with discs, 1e6 if P provides a
     #: preconditioner, else 1e4
     rho: float = 0.0
-    rho_growth: float = 1.0  #: multiplies ρ if the Lagrangian grows too little
     M: float = 1.0  #: initial M in units of ‖𝒫F𝒫‖; inner runs end at ‖g^P‖ ≤ M‖Cν‖
     beta: float = 0.5  #: multiplies M if the Lagrangian grows too little
     eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at the end of an inner run
-    Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
+    Gamma: float = 1.0  #: proportioning constant Γ of MPRGP: ‖β‖² > Γ²φ̃ᵀφ
     # if P is sparse, conjugation against stored directions costs more than a product
     recycle: bool = (
         True  #: make CG directions conjugate to all stored ones, unless P is sparse
     )
-    reduced: bool = True  #: proportion if ‖β‖² > Γ²φ̃ᵀφ; False: if ‖β‖² > Γ²φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     # n/10 is the limit without equality rows
     lanczos_steps: int = 12  #: limit of Lanczos steps; at most n/6 or n/10, at least 5
@@ -77,13 +63,10 @@ class Options:
             raise ValueError(f"beta = {self.beta}; expected a number between 0 and 1")
         if not 0 <= self.rho < np.inf:
             raise ValueError(f"rho = {self.rho}; expected 0, or a positive number")
-        if not self.rho_growth >= 1:
-            raise ValueError(f"rho_growth = {self.rho_growth}; expected at least 1")
         if not self.alpha <= 2:
             raise ValueError(f"alpha = {self.alpha}; expected at most 2")
         choices = {
-            "expansion": EXPANSIONS,
-            "proportioning": PROPORTIONINGS,
+            "expansion": get_args(Expansion),
             "preconditioner": PRECONDITIONERS,
             "eliminate": get_args(Eliminate),
         }

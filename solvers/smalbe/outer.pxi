@@ -85,12 +85,10 @@ cdef class SMALBE(MPRGP):
         self.Gamma_square *= self.Gamma_square
         if options.expansion == "spectral":
             self.Gamma_square *= SPECTRAL_GAMMA
-        self.reduced = options.reduced
-        self.expansion = EXPANSIONS[options.expansion]
+        self.expansion = SPECTRAL if options.expansion == "spectral" else MODEL
         self.step_rule = step_rule
         if step_rule is not None:
             self.expansion = OWN
-        self.proportions_by_model = options.proportioning == "model"
         self.plain = self.expansion != MODEL
         self.spectral_length = 0.0
         self.preconditioned = preconditioned
@@ -274,7 +272,7 @@ cdef class SMALBE(MPRGP):
 
         1. Run MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
         2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖²
-           since the previous outer iteration: M ← βM, and ρ ← ρ·growth.
+           since the previous outer iteration: M ← βM.
         3. μ ← μ + ρCν. The gradient changes by ρQν, without a product. H is unchanged,
            so the directions of CG remain conjugate on an unchanged face.
 
@@ -297,7 +295,7 @@ cdef class SMALBE(MPRGP):
         aim : largest estimate of the relative KKT residual that ends the loop; 0 for tol
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
-        cdef double before = -INFINITY, lagrangian, error, growth = options.rho_growth
+        cdef double before = -INFINITY, lagrangian, error
         cdef long left = options.max_steps
         cdef bint stopped, enough, solved, stalled
         memcpy(self.x, address(at.nu), n * sizeof(double))
@@ -356,8 +354,6 @@ cdef class SMALBE(MPRGP):
                 mu[i] += self.rho * self.Cv[i]
             if not enough:
                 self.M_now *= options.beta
-                if growth != 1:
-                    self.change_penalty(growth * self.rho)
             if stalled and self.rows.are_met(self.x, self.Cv, tol, self.b_size):
                 self.M_now /= 10
             elif stalled:

@@ -123,14 +123,15 @@ def test_the_code_of_your_own_steps(run_code):
     found = run_code("own-steps")
     products, counts = found["counts"].P_products, found["counts"]
     bearing, string = found["cases"]
-    wasted = found["uphill"].solution.counts["fallback"]
+    uphill = found["uphill"]
 
     assert set(counts.verdict) == {"verified"}
-    assert products[bearing, "ssor"] < products[bearing, "textbook"] / 10
+    assert products[bearing, "ssor"] < products[bearing, "plain"] / 10
     assert products[string, "ssor-projected"] < products[string, "ssor"]
-    assert products[string, "ssor"] < products[string, "textbook"] / 4
-    assert str(found["uphill"].verdict) == "verified"
-    assert wasted == counts.expansion[string, "textbook"]
+    assert products[string, "ssor"] < products[string, "plain"] / 3
+    assert str(uphill.verdict) == "verified"
+    assert uphill.solution.counts["fallback"] > 0
+    assert "expansion" not in uphill.solution.counts
     found["plt"].close("all")
 
 

@@ -62,7 +62,7 @@ class WithRule(SMALBE):
         return self.rule
 
 
-PLAIN = dict(expansion="std", proportioning="cg", recycle=False, eliminate="never")
+PLAIN = dict(recycle=False, eliminate="never")
 
 
 def test_the_inverse_as_preconditioner_needs_one_cg_step():
@@ -105,7 +105,7 @@ def test_a_step_rule_receives_the_problem_in_its_original_units():
         seen.append(step)
         return step.x - step.alpha_f * step.p
 
-    WithRule(rule=rule, proportioning="cg").prepare(qp, 1e-6)()
+    WithRule(rule=rule).prepare(qp, 1e-6)()
 
     assert seen
     for x, g, p, lb, ub, cg, feasible, bar in seen:
@@ -127,9 +127,7 @@ def test_a_trial_point_outside_is_projected():
     n = 20
     q = np.linspace(-1, 1, n)
     qp = bounded(np.eye(n), q, np.full(n, -0.3), np.full(n, 0.4))
-    s = WithRule(rule=lambda step: step.x - step.g, proportioning="cg").prepare(
-        qp, 1e-10
-    )()
+    s = WithRule(rule=lambda step: step.x - step.g).prepare(qp, 1e-10)()
 
     assert s.status is Status.SOLVED
     assert s.x == pytest.approx(np.clip(-q, -0.3, 0.4), abs=1e-12)
@@ -164,17 +162,6 @@ def test_no_step_rule_affects_accuracy_or_increases_the_cost(name):
         cost, outer = s.history["cost"], s.history["outer"]
         fall = np.diff(cost)[np.diff(outer) == 0]
         assert (fall <= 1e-9 * abs(cost).max()).all()
-
-
-def test_useless_step_rules_are_replaced_by_the_standard_expansion():
-    qp, _ = qp_with_solution(25, 4)
-    std = SMALBE(preconditioner="none", **PLAIN).prepare(qp, 1e-8)()
-    options = {**PLAIN, "preconditioner": "none"}
-    own = WithRule(rule=RULES["stays"], **options).prepare(qp, 1e-8)()
-
-    assert own.counts["fallback"] == std.counts["expansion"]
-    assert own.counts["P_products"] == std.counts["P_products"] + own.counts["fallback"]
-    assert (own.x == std.x).all()
 
 
 @pytest.mark.parametrize(

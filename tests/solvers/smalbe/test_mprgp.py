@@ -12,7 +12,6 @@ import pytest
 
 from mortarbench.harness import no_rows
 from mortarbench.solvers.smalbe.compiled import SMALBE, Product, Rows
-from mortarbench.solvers.smalbe.options import EXPANSIONS
 from mortarbench.solvers.smalbe.projected import Iterate, Projected, Spectrum
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 from mortarbench.solvers.smalbe.spectrum import Ritz
@@ -23,11 +22,9 @@ class Rules(NamedTuple):
     """Options of MPRGP, see `solvers.smalbe.options`."""
 
     Gamma: float = 1.0
-    expansion: str = "model"
-    proportioning: str = "model"
-    reduced: bool = True
     relaxation: float = 1.9
     kept: int = 0
+    step_rule: Any = None  #: `solvers.smalbe.extension.StepRule`
 
 
 class Model(NamedTuple):
@@ -47,7 +44,11 @@ class Point(NamedTuple):
     g: Any
 
 
-MIXED = Rules(expansion="mixed", proportioning="cg")  # allows every type of step
+def projected_cg(step):
+    return step.x - step.alpha_cg * step.p
+
+
+PROJECTED = Rules(step_rule=projected_cg)  # allows every type of step
 
 
 def run_compiled(
@@ -55,11 +56,11 @@ def run_compiled(
 ):
     """Run the compiled MPRGP on a problem without rows.
 
-    A model corresponds to Ritz pairs without residuals. Expansions without a model use
-    τ = 1/ᾱ, so they are run in units in which this holds.
+    A model corresponds to Ritz pairs without residuals. Step rules work without a model
+    and use τ = 1/ᾱ, so they are run in units in which this holds.
     """
     B = B or Model.of_norm(tau, b.size)
-    unit = 1.0 if rules.expansion == "model" else rules.relaxation * B.tau
+    unit = rules.relaxation * B.tau if rules.step_rule else 1.0
     order = np.argsort(-B.w)
     ritz = Ritz(
         np.append(B.w[order] + B.tau, B.tau), np.zeros(B.w.size + 1),
@@ -71,14 +72,13 @@ def run_compiled(
         (lower, upper), -b, np.zeros(0),
     )  # fmt: skip
     options = SimpleNamespace(
-        Gamma=rules.Gamma, expansion=rules.expansion, reduced=rules.reduced,
-        proportioning=rules.proportioning, alpha=rules.relaxation,
+        Gamma=rules.Gamma, expansion="model", alpha=rules.relaxation,
         recycle=rules.kept > 0, max_steps=max_steps, eta=0.1, beta=0.5,
-        rho_growth=1.0,
     )  # fmt: skip
     solver = SMALBE(
-        problem, options, M is not None, None if M is None else M.__matmul__
-    )
+        problem, options, M is not None, None if M is None else M.__matmul__,
+        rules.step_rule,
+    )  # fmt: skip
     at = Iterate(x, (A @ x - b) / unit, np.zeros(0), 1.0, 1.0)
     omega = Omega(lower, upper)
 
@@ -109,7 +109,7 @@ def minimised(
     *,
     alpha=None,
     tol=1e-10,
-    rules=MIXED,
+    rules=PROJECTED,
     B=None,
     M=None,
     **options,
@@ -142,25 +142,17 @@ def test_proportioning_when_beta_exceeds_gamma_times_phi(minimise, Gamma, first)
     """‖β‖ = 2 and ‖φ̃‖ = ‖φ‖ = 1, so Γ = 2 is the threshold. The algorithm compares
     ‖β‖² with Γ²‖φ‖².
     """
-    rules = Rules(Gamma, "mixed", "cg")
+    rules = PROJECTED._replace(Gamma=Gamma)
     run, _ = minimise(np.eye(2), [-1.0, 2.0], [-np.inf, 0.0], rules=rules)
 
     assert run.trace[0] == first
 
 
 def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning(minimise):
-    """φ = 1 but φ̃ = 10⁻⁹ in the first component: with the corresponding option, the
-    reduced gradient decides.
-    """
-    first = [
-        minimise(
-            np.eye(2), [-1.0, 0.01], [-1e-9, 0.0], x=[0, 0], alpha=1.0,
-            rules=Rules(1.0, "mixed", "cg", reduced=r),
-        )[0].trace[0]
-        for r in (True, False)
-    ]  # fmt: skip
+    """φ = 1 but φ̃ = 10⁻⁹ in the first component: the reduced gradient decides."""
+    run, _ = minimise(np.eye(2), [-1.0, 0.01], [-1e-9, 0.0], x=[0, 0], alpha=1.0)
 
-    assert first == ["p", "e"]
+    assert run.trace[0] == "p"
 
 
 def test_proportioning_stops_at_the_opposite_bound(minimise):
@@ -232,7 +224,7 @@ def test_an_unbounded_cost_is_not_called_a_minimum(minimise):
     assert not run.stopped
 
 
-@pytest.mark.parametrize("expansion", sorted({*EXPANSIONS} - {"projcg", "spectral"}))
+@pytest.mark.parametrize("rules", [Rules(), PROJECTED], ids=["model", "projected cg"])
 @pytest.mark.parametrize(
     "seed",
     [
@@ -241,10 +233,9 @@ def test_an_unbounded_cost_is_not_called_a_minimum(minimise):
     ],
 )
 def test_every_iterate_is_feasible_and_the_cost_never_rises(
-    minimise, manufactured, seed, expansion
+    minimise, manufactured, seed, rules
 ):
     qp, _ = manufactured("box", seed=seed, dense=True, n=24)
-    rules = Rules(expansion=expansion, proportioning="cg")
     costs = []
     for steps in range(30):
         run, _ = minimise(
@@ -349,9 +340,8 @@ def test_an_expansion_by_the_model_begins_with_the_half_step(minimise):
     """
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
     B = Model.of_norm(np.linalg.norm(A, 2), 2)
-    rules = Rules(proportioning="cg")
-    before, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=1, B=B, rules=rules)
-    after, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=2, B=B, rules=rules)
+    before, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=1, B=B, rules=Rules())
+    after, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=2, B=B, rules=Rules())
     p = before.x - np.array([-1.0, 0.0])
     half = before.x - before.x[0] / p[0] * p
     g = A @ half - b
@@ -407,11 +397,10 @@ def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it(minimise)
 
 
 def test_every_model_step_decreases_the_cost(minimise):
-    for expansion in ("model", "std"):
-        steps, _ = model_run(minimise, string(), Rules(expansion=expansion))
-        costs = [cost for _, _, cost in steps]
+    steps, _ = model_run(minimise, string(), Rules())
+    costs = [cost for _, _, cost in steps]
 
-        assert (np.diff(costs) <= 1e-13 * abs(costs[-1])).all()
+    assert (np.diff(costs) <= 1e-13 * abs(costs[-1])).all()
 
 
 def tight_box(seed):

@@ -42,10 +42,7 @@ def outer_loop():
     """
 
     def run(problem, x, *, tol, max_steps=20_000, at=None):
-        options = SMALBE(
-            expansion="mixed", proportioning="cg", preconditioner="none", M=1.0,
-            beta=0.5, eta=0.1, max_steps=max_steps or 1, recycle=False,
-        )  # fmt: skip
+        options = SMALBE(preconditioner="none", max_steps=max_steps or 1, recycle=False)
         object.__setattr__(options, "max_steps", max_steps)
         chosen = driver.outer_loop(problem, None, options)
         zero = np.zeros(len(problem.rows.C))

@@ -16,7 +16,7 @@ from mortarbench.solvers.smalbe.driver import outer_loop
 from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-BETWEEN = dict(expansion="std", proportioning="cg", eliminate="never")
+BETWEEN = dict(eliminate="never")
 
 
 def chain(n):

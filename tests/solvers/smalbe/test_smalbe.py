@@ -48,12 +48,8 @@ def lanczos(H, start, steps):
 
 @pytest.fixture
 def outer_loop():
-    def run(problem, *, M=1.0, eta=0.1, rho=3.0, growth=1.0, tol=1e-8):
-        options = SMALBE(
-            expansion="mixed", proportioning="cg", preconditioner="none", M=M,
-            beta=0.5, eta=eta, rho_growth=growth, max_steps=20_000,
-            recycle=False,
-        )  # fmt: skip
+    def run(problem, *, M=1.0, eta=0.1, rho=3.0, tol=1e-8):
+        options = SMALBE(preconditioner="none", M=M, eta=eta, recycle=False)
         chosen = driver.outer_loop(problem, None, options)
         x, mu = np.zeros(problem.b.size), np.zeros(len(problem.rows.C))
         return chosen.solve(tol, chosen.first(x, mu, M=M, rho=rho))
@@ -241,7 +237,7 @@ def test_the_model_uses_the_lanczos_process_and_the_rows(dual):
     "wrong",
     [dict(rho=-1.0), dict(rho=np.inf), dict(M=0.0), dict(beta=1.0), dict(beta=2.0),
      dict(Gamma=-1.0), dict(lanczos_steps=0), dict(max_steps=-1), dict(alpha=2.1),
-     dict(rho_growth=0.5), dict(expansion="gp"), dict(preconditioner="ilu"),
+     dict(expansion="gp"), dict(preconditioner="ilu"),
      dict(eliminate="yes")],
     ids=str,
 )  # fmt: skip
@@ -368,27 +364,17 @@ def test_M_shrinks_while_the_lagrangian_grows_too_little(outer_loop, dual, seed)
     assert False in cut
 
 
-def test_the_penalty_grows_if_the_lagrangian_does_not(outer_loop, dual):
-    """The penalty is multiplied by `rho_growth` when M is reduced, and by 10 when the
-    loop stalls.
-    """
-    outer = outer_loop(projected(dual(271828)), M=1e3, eta=1e9, growth=4.0).outer
-    factors = [later.rho / o.rho for o, later in pairwise(outer[1:])]
-    cut = [later.M < o.M for o, later in pairwise(outer[1:])]
-
-    assert [f in (4, 40) for f in factors] == cut
-    assert {f for f, c in zip(factors, cut, strict=True) if not c} <= {1, 10}
-    assert True in cut
-
-
-@pytest.mark.parametrize(("growth", "rounding"), [(1.0, 1e-13), (4.0, 1e-12)])
-def test_the_carried_gradient_is_the_gradient(outer_loop, dual, growth, rounding):
+@pytest.mark.parametrize("rho", [1e-3, 3.0])
+def test_the_carried_gradient_is_the_gradient(outer_loop, dual, rho):
+    """This includes changes of the penalty."""
     problem = projected(dual(271828))
-    end = outer_loop(problem, M=10.0, growth=growth, tol=1e-6)
+    end = outer_loop(problem, M=10.0, rho=rho, tol=1e-6)
     C = problem.rows.C
 
+    assert end.rho > rho
+
     fresh = hessian(problem, end.rho) @ end.nu - problem.b + C.T @ end.mu
-    assert end.g == pytest.approx(fresh, abs=rounding)
+    assert end.g == pytest.approx(fresh, abs=1e-12)
 
 
 def test_the_projected_problem_is_normalised_and_projected(dual):
@@ -468,15 +454,12 @@ def test_random_planted_problems_are_solved_and_certified(manufactured, shape, s
         assert s.x == pytest.approx(planted_point.x, abs=1e-6), seed
 
 
-@pytest.mark.parametrize("expansion", ["std", "mixed", "model"])
-@pytest.mark.parametrize("proportioning", ["cg", "model"])
+@pytest.mark.parametrize("expansion", ["model", "spectral"])
 @pytest.mark.parametrize("preconditioner", ["none", "diagonal", "model"])
 def test_every_combination_of_rules_solves(
-    manufactured, dual, expansion, proportioning, preconditioner
+    manufactured, dual, expansion, preconditioner
 ):
-    solver = SMALBE(
-        expansion=expansion, proportioning=proportioning, preconditioner=preconditioner
-    )
+    solver = SMALBE(expansion=expansion, preconditioner=preconditioner)
     for qp in (manufactured("box", seed=161803)[0], dual(161803)):
         s = solver.prepare(qp, 1e-8)()
 
