@@ -473,14 +473,15 @@ def test_every_combination_of_rules_solves(
         (4, 3, 1, (46, 56)), (4, 3, 10, (54, 73)),
         (12, 6, 5, (59, 84)), (12, 6, 10, (72, 103)), (12, 7, 10, (58, 87)),
         pytest.param(30, 15, 1, (57, 90), marks=pytest.mark.slow),
-        pytest.param(30, 15, 5, (58, 91), marks=pytest.mark.slow),
+        pytest.param(30, 15, 5, (60, 91), marks=pytest.mark.slow),
         pytest.param(30, 15, 10, (67, 107), marks=pytest.mark.slow),
         pytest.param(60, 30, 5, (64, 105), marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
     """The products of PERMON were measured on these QPs with its best setting at 1e-6
-    and 1e-8; the stopping criterion is recomputed from the QP.
+    and 1e-8; the stopping criterion is recomputed from the QP. One limit is 0.52 of
+    PERMON's products, as docs/performance.md states.
     """
     family = PROBLEMS["beam-ring"]
     configured = family.with_keys(Nr=Nr, Nh=Nh, step=step)
