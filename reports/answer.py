@@ -15,13 +15,16 @@ import numpy as np
 import pandas as pd
 
 from mortarbench.reports.document import (
+    ABSENT,
     Table,
     accuracy_text,
+    interval,
+    number,
     plural,
     short,
     short_name,
 )
-from mortarbench.reports.intervals import Pooled, PowerLaw, pooled, power_law
+from mortarbench.reports.intervals import Interval, Pooled, PowerLaw, pooled, power_law
 from mortarbench.reports.measurements import KEY, Measurements, in_order
 
 COMPLETE = 0.9  #: share of the cases that a solver must solve to be named fastest
@@ -116,6 +119,7 @@ def _row(
     logs = _logs(run.df, timed)
     means = timed.pivot_table("total_seconds", "case", "solver", "first")
     first = fastest(np.log(means))
+    first = _first_by_pairs(logs, means, first)
     entries = []
     for solver in labels:
         mine = every[every.solver == solver]
@@ -123,6 +127,8 @@ def _row(
         if first and solver in means:
             both = means.index[means[[first, solver]].notna().all(axis=1)]
             time = compared(logs, first, solver, both) if len(both) else None
+            if time and solver == first:
+                time = time._replace(ratio=Interval(1.0, 1.0, 1.0))
         elif (mine.status == "declined").all():
             note = "declined"
         elif mine.remembered.any():
@@ -140,6 +146,19 @@ def _row(
         entries=tuple(entries),
         chosen=good,
     )
+
+
+def _first_by_pairs(logs: Logs, means: pd.DataFrame, first: str) -> str:
+    """Return the solver with the least ratio to `first` of those that compete."""
+    solved = means.notna().sum()
+    ratios = {
+        solver: compared(logs, first, solver, both).ratio.value
+        for solver in means
+        if first and solved[solver] >= COMPLETE * len(means)
+        for both in [means.index[means[[first, solver]].notna().all(axis=1)]]
+        if len(both)
+    }
+    return min(ratios, key=lambda solver: ratios[solver], default=first)
 
 
 def fastest(logs: pd.DataFrame) -> str:
@@ -277,8 +296,9 @@ def table(found: Sequence[Row], solvers: Sequence[str]) -> Table:
         rows=tuple(lines),
         caption="Time relative to the fastest solver of the row: geometric mean over "
         "the cases with its 95 % interval (Student's, over cases; over repeats of a "
-        "single case). Below: cases solved with this accuracy, and the exponent p "
-        "of time ∝ mᵖ, m the size of the dual.",
+        "single case). Below: cases solved with this accuracy, and the exponent p of "
+        "time ∝ mᵖ, m the size of the dual. Solvers with fewer than 90 % of the cases "
+        "do not compete; they are compared on the cases that they solved.",
         data=pd.DataFrame(
             data,
             columns=[
@@ -301,10 +321,13 @@ def table(found: Sequence[Row], solvers: Sequence[str]) -> Table:
 def _cell(e: Entry | None) -> str:
     if e is None:
         return ""
-    if e.time is None:
-        return e.note or f"–\n{e.met}/{e.cases}"
     below = f"{e.met}/{e.cases}"
+    if e.time is None:
+        return e.note or f"{ABSENT}\n{below}"
     if e.growth:
-        below += f" · m^{e.growth.exponent.value:.2g}"
-    is_first = e.time.ratio.value == 1 and e.time.ratio.low == 1
-    return f"{'1 (fastest)' if is_first else short(e.time)}\n{below}"
+        below += f" · m^{e.growth.exponent.value:.1f}"
+    ratio = e.time.ratio
+    if ratio.low == ratio.value == 1:
+        return f"1 (fastest)\n{below}"
+    ends = [interval(ratio)] * ratio.is_known
+    return "\n".join([f"{number(ratio.value, 2)} ×", *ends, below])

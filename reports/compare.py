@@ -29,6 +29,9 @@ from mortarbench.reports.document import interval, number, plural
 from mortarbench.reports.intervals import Array, Interval, student, widened
 from mortarbench.reports.measurements import CELL, SEVERITY, Measurements
 
+#: Factor from the half-width of a 95 % interval to 99 % (normal distribution). To pass
+#: a slower solver is worse than not to decide.
+PASSED = 1.31
 MOST_REPEATS = 10_000  #: largest number of repeats that is recommended
 
 
@@ -44,13 +47,14 @@ def judged(ratio: Interval | None, limit: float) -> Outcome:
     """Judge a ratio of times: slower, not slower, or undecided.
 
     A solver is slower if the ratio is at least `limit` and its interval excludes 1, and
-    not slower if the interval lies below `limit`.
+    not slower if its 99 % interval lies below `limit`.
     """
     if ratio is None or not ratio.is_known:
         return Outcome.CANNOT_TELL
     if ratio.value >= limit and ratio.low > 1:
         return Outcome.SLOWER
-    return Outcome.NOT_SLOWER if ratio.high < limit else Outcome.CANNOT_TELL
+    high = ratio.value * (ratio.high / ratio.value) ** PASSED
+    return Outcome.NOT_SLOWER if high < limit else Outcome.CANNOT_TELL
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,7 +115,7 @@ class Change:
         needed = self.repeats * (half / np.log(limit)) ** 2
         # the mean itself may be close to the limit
         more = int(min(np.ceil(max(needed, 2 * self.repeats)), MOST_REPEATS))
-        return f"{least}; use --repeats {more}"
+        return f"{least}; run again with --repeats {more}"
 
 
 def compare(

@@ -95,6 +95,7 @@ def write_comparison(
         dateline="",
         sections=tuple(sections),
         solvers=tuple(dict.fromkeys(c.after for c in changes)),
+        footer="Tables: tables/*.csv and tables/*.tex.",
     )
     return write_document(document, target, formats)
 
@@ -114,8 +115,9 @@ def _table(changes: Sequence[Change]) -> Table:
             for c in changes
         ),
         caption="Geometric mean, over the cells that were verified both times, of the "
-        "time after relative to before, with Welch's interval from the scatter of the "
-        "repeats. A cell is a case at a tolerance.",
+        "time after relative to before, with the interval by Welch (two runs) or "
+        "Student (two solvers of one run) from the scatter of the repeats, and the "
+        "error of processes. A cell is a case at a tolerance.",
     )
 
 

@@ -8,6 +8,7 @@ import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -27,7 +28,7 @@ _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 class Table:
     """A table whose cells are plain text, with its numbers as a data frame.
 
-    A line break in a cell begins its second line, which is set in small type.
+    Line breaks in a cell begin further lines, which are set in small type.
     """
 
     name: str  #: stem of its files
@@ -249,7 +250,7 @@ def latex(tables: Sequence[Table], *, intervals: bool = True) -> str:
 
     No packages are needed.
 
-    intervals : False to omit the second lines of the cells
+    intervals : False to omit the further lines of the cells
     """
     return "\n".join(_tex_table(table, intervals) for table in tables)
 
@@ -257,11 +258,12 @@ def latex(tables: Sequence[Table], *, intervals: bool = True) -> str:
 def _tex_table(table: Table, intervals: bool) -> str:
     lines = []
     for row in table.rows:
-        above, _, below = zip(*(cell.partition("\n") for cell in row), strict=True)
+        above, *below = zip_longest(*(cell.split("\n") for cell in row), fillvalue="")
         lines.append(" & ".join(map(_tex, above)) + r" \\")
-        if intervals and any(below):
-            small = [rf"{{\scriptsize {_tex(b)}}}" if b else "" for b in below]
-            lines.append(" & ".join(small) + r" \\[2pt]")
+        for parts in below if intervals else ():
+            small = [rf"{{\scriptsize {_tex(b)}}}" if b else "" for b in parts]
+            lines.append(" & ".join(small) + r" \\")
+        lines[-1] += "[2pt]"
     columns = "l" * table.texts + "r" * (len(table.head) - table.texts)
     return "\n".join(
         [

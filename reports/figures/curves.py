@@ -48,7 +48,7 @@ def answer_figure(found: Sequence[Row], solvers: Sequence[str]) -> Figure:
     shown = [row for row in found if len(row.ranked) > 1][-MOST_PANELS:]
     most = max(len(row.ranked) for row in shown)
     with styled():
-        figure, axes = panels(len(shown), height=0.55 + 0.21 * most, sharex=True)
+        figure, axes = panels(len(shown), height=0.55 + 0.21 * most)
         for one, row in zip(axes, shown, strict=True):
             names = [e.solver for e in row.ranked]
             for place, entry in enumerate(row.ranked):
@@ -66,6 +66,8 @@ def answer_figure(found: Sequence[Row], solvers: Sequence[str]) -> Figure:
             one.axvline(1, color=INK, lw=0.6)
             one.set_title(legible(f"{row.form or 'QP'}, {row.label}", 64))
             one.grid(visible=False, axis="y")
+            values = [e.time.ratio.value for e in row.ranked if e.time]
+            one.set_xlim(min(values) / 4, max(values) * 4)  # intervals may be endless
             logarithmic(one, "x")
         for one in axes[-2:]:
             one.set_xlabel("time relative to the fastest")

@@ -15,7 +15,6 @@ from mortarbench.reports.document import (
     Table,
     clean,
     number,
-    plural,
     seconds,
     short,
     short_name,
@@ -65,12 +64,15 @@ def _ways(answers: pd.DataFrame, forms: list[str]) -> Iterator[Item]:
     for form in forms:
         of_form = [each for each in found if each[1].endswith(f" on {form}")]
         best |= {form: of_form[0]} if of_form else {}
+    tied = [f"{name} {short(t)}" for t, name, _ in found[1:3] if t.ratio.low <= 1]
+    lead = f"cannot tell {first} from {', '.join(tied)}" if tied else f"{first} fastest"
     others = [
         f"best on {form}: {clean(name.removesuffix(f' on {form}'), 40)} {short(time)}"
         for form, (time, name, _) in best.items()
         if name != first
     ]
-    yield "; ".join([f"{clean(first, 60)} fastest, dualisation charged", *others]) + "."
+    tol = tolerance(float(answers.tol.min()))
+    yield "; ".join([f"{clean(lead, 200)}, dualisation charged", *others]) + "."
     yield Table(
         name="ways",
         head=("solver and form", "time relative to the fastest", "problems"),
@@ -82,9 +84,9 @@ def _ways(answers: pd.DataFrame, forms: list[str]) -> Iterator[Item]:
             )
             for time, name, n in found[:MOST_WAYS]
         ),
-        caption="Time of dualisation (dual forms), preparation and solve: geometric "
-        "mean over the problems, with Student's 95 % interval. Assembly, the same for "
-        "all forms, is not included.",
+        caption="Time of dualisation (dual forms), preparation and solve at tolerance "
+        f"{tol}: geometric mean over the problems, with Student's 95 % interval. "
+        "Assembly, the same for all forms, is not included.",
     )
 
 
@@ -237,7 +239,7 @@ def ranks(run: Measurements, rows: list[Row]) -> Iterator[Item]:
     )  # fmt: skip
     yield Picture(
         name="ranks",
-        caption=f"Solve time on {plural(df.ranks.nunique(), 'number')} of ranks; bars: "
-        "95 % intervals of the medians.",
+        caption="Solve time against the number of ranks; bars: 95 % intervals of the "
+        "medians.",
         draw=partial(curves.ranks, df),
     )

@@ -214,7 +214,8 @@ def scaling(run: Measurements, rows: list[Row]) -> Iterator[Item]:
             head=("form", "solver", "m", "against n", "against m"),
             rows=tuple(fits),
             caption="Exponents p of time ∝ nᵖ (degrees of freedom) and time ∝ mᵖ (size "
-            "of the dual), with Student's 95 % intervals; verified answers only.",
+            f"of the dual) at tolerance {tolerance(float(solved.tol.min()))}, with "
+            "Student's 95 % intervals; verified answers only.",
             texts=2,
         )
         if curves.against(solved, run.solvers) is not None:

@@ -38,13 +38,13 @@ def outcomes(factor, **more):
 def test_unchanged_solvers_are_not_slower():
     found = outcomes(1.0)
     assert Outcome.SLOWER not in found
-    assert found.count(Outcome.NOT_SLOWER) >= 160
+    assert found.count(Outcome.NOT_SLOWER) >= 120
 
 
 def test_a_slowdown_of_a_quarter_is_found_and_never_passed():
     found = outcomes(1.25)
     assert found.count(Outcome.SLOWER) >= 120
-    assert found.count(Outcome.NOT_SLOWER) <= 5  # 2.5 %, by the 95 % interval
+    assert found.count(Outcome.NOT_SLOWER) <= 2
     assert outcomes(1.5).count(Outcome.SLOWER) == 200
 
 
@@ -59,7 +59,7 @@ def test_what_cannot_be_told_has_a_number():
     line = change(rng, noise=0.5, cases=2, repeats=3).sentence(LIMIT)
     assert line.startswith("cannot tell: a takes")
     assert "the smallest detectable factor here is" in line
-    assert "use --repeats" in line
+    assert "run again with --repeats" in line
 
 
 def test_a_single_repeat_has_no_interval():
