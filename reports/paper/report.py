@@ -128,7 +128,6 @@ def facts(experiment: Experiment, tables: Mapping[str, pd.DataFrame]) -> dict[st
         for letter, name in zip("abcd", bodies.STRESSES, strict=True)
         for clipped, largest in [bodies.extent(states["largest"], name)]
     )
-    dense = tables["figure5"].query("method == 'pinv'")
     steps = physics.active(tables["pressures"], "nts").step
     patch = tables["verification"].query("problem == 'patch'").sort_values("n")
     errors = patch.groupby("contact").error
@@ -141,7 +140,7 @@ def facts(experiment: Experiment, tables: Mapping[str, pd.DataFrame]) -> dict[st
         "nodes_one": len(states["example-Nh"].points),
         "nodes_two": len(states["example-2Nh"].points),
         "repeats": {name: _repeats(tables[name]) for name in TIMED},
-        "dense": dense.n.max(),
+        "dense": tables["figure5"].query("method == 'pinv'").n.max(),
         "percentile": PERCENTILE,
         "ends": ", ".join(ends),
         "first_active": (steps == 1).sum(),
@@ -154,8 +153,7 @@ def facts(experiment: Experiment, tables: Mapping[str, pd.DataFrame]) -> dict[st
 
 def _repeats(rows: pd.DataFrame) -> str:
     """Return the number of repeats behind the medians, or its range."""
-    sizes = [key for key in ("Nr", "Nh", "method") if key in rows]
-    most = rows.groupby(sizes).repeat.max() + 1
+    most = rows.groupby([*rows.columns.drop(["repeat", "seconds"])]).repeat.max() + 1
     least = f"{most.min()} to " if most.min() < most.max() else ""
     return f"{least}{plural(int(most.max()), 'repeat')}"
 
