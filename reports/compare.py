@@ -64,6 +64,7 @@ class Change:
     before: str  #: label before
     after: str  #: label after
     ratio: Interval | None  #: time after relative to before; None without common cells
+    busy: bool  #: True if other programs occupied the machine in one of two runs
     other_machine: bool  #: True if common cells have times, but of other machines
     cells: int  #: number of cells with a ratio
     repeats: float  #: mean number of repeats of these cells
@@ -85,7 +86,7 @@ class Change:
 
     def outcome(self, limit: float) -> Outcome:
         """Judge whether the solver is slower than before by the factor `limit`."""
-        return judged(self.ratio, limit)
+        return Outcome.CANNOT_TELL if self.busy else judged(self.ratio, limit)
 
     def sentence(self, limit: float) -> str:
         """Return the judgement with its numbers in one line."""
@@ -103,6 +104,8 @@ class Change:
         return f"cannot tell: {self.name} takes {over}; {self._advice(limit)}"
 
     def _advice(self, limit: float) -> str:
+        if self.busy:
+            return "other programs were running; compare both versions in one run"
         assert self.ratio is not None
         if not self.ratio.is_known:
             return "a single repeat has no interval; use --repeats 7"
@@ -171,6 +174,7 @@ def _change(
         cells=len(ratios),
         repeats=float(by_cell.repeats.mean()) if ratios else 0.0,
         sessions=sessions,
+        busy=not paired and (_busy(before) or _busy(after)),
         other_machine=bool(cells) and not ratios,
         by_cell=by_cell,
         statuses=statuses,
@@ -184,6 +188,16 @@ class CellRatio(NamedTuple):
     square: float  #: squared standard error; NaN for single repeats
     freedom: float
     repeats: float
+
+
+def _busy(run: Measurements) -> bool:
+    """Return True if a run began with more running processes than cores."""
+    for environment in run.environments.values():
+        load: Any = (environment.get("now") or {}).get("load")
+        cores: Any = (environment.get("machine") or {}).get("usable_cores")
+        if all(isinstance(v, int | float) for v in (load, cores)) and load > cores:
+            return True
+    return False
 
 
 def _machines(before: Measurements, after: Measurements) -> dict[str, str]:

@@ -105,3 +105,15 @@ def test_welch_equals_student_for_equal_variances_and_sizes():
     assert found.mean == 1
     assert found.square == pytest.approx(2 / 3)
     assert found.freedom == pytest.approx(4)
+
+
+def test_two_runs_on_a_busy_machine_are_not_judged():
+    rng = np.random.default_rng(8)
+    busy = {"e": {"now": {"load": 4.2}, "machine": {"usable_cores": 2}}}
+    before = measurements(timed(rng, "a", 3, 7), "old")
+    after = measurements(timed(rng, "a", 3, 7, 0.02), "new", environments=busy)
+    (found,) = compare(before, after, [("a", "a")])
+    assert found.outcome(LIMIT) is Outcome.CANNOT_TELL
+    assert "other programs were running" in found.sentence(LIMIT)
+    (within,) = compare(after, after, [("a", "a")])
+    assert within.outcome(LIMIT) is Outcome.NOT_SLOWER
