@@ -141,7 +141,7 @@ def curve(
 
 
 def logarithmic(axes: Axes, which: str = "both") -> None:
-    """Make axes logarithmic, with legible ticks on short ones."""
+    """Set logarithmic scales, with legible ticks on short axes."""
     for name in ("x", "y") if which == "both" else (which,):
         getattr(axes, f"set_{name}scale")("log")
         axis = getattr(axes, f"{name}axis")

@@ -126,9 +126,9 @@ def test_the_code_of_your_own_steps(run_code):
     uphill = found["uphill"]
 
     assert set(counts.verdict) == {"verified"}
-    assert products[bearing, "ssor"] < products[bearing, "plain"] / 10
+    assert products[bearing, "ssor"] < products[bearing, "textbook"] / 10
     assert products[string, "ssor-projected"] < products[string, "ssor"]
-    assert products[string, "ssor"] < products[string, "plain"] / 3
+    assert products[string, "ssor"] < products[string, "textbook"] / 4
     assert str(uphill.verdict) == "verified"
     assert uphill.solution.counts["fallback"] > 0
     assert "expansion" not in uphill.solution.counts

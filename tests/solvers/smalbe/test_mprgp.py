@@ -16,6 +16,7 @@ from mortarbench.solvers.smalbe.projected import Iterate, Projected, Spectrum
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 from mortarbench.solvers.smalbe.spectrum import Ritz
 from mortarbench.solvers.smalbe.textbook import Omega
+from tests.support.permon import string
 
 
 class Rules(NamedTuple):
@@ -247,20 +248,6 @@ def test_every_iterate_is_feasible_and_the_cost_never_rises(
         assert (run.x <= qp.ub).all()
         assert run.g == pytest.approx(qp.P @ run.x + qp.q, abs=1e-12)
     assert np.diff(costs).max() <= 1e-13 * abs(costs[0])
-
-
-def string():
-    """Return matrix, load and obstacle of the string of PERMON's first tutorial.
-
-    The string has 100 points and lies above a sine-shaped obstacle.
-    """
-    n, h = 100, 1 / 99
-    A = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
-    A[[0, -1]], A[:, [0, -1]] = 0, 0
-    A[[0, -1], [0, -1]] = 1
-    inside = np.r_[0, np.ones(n - 2), 0]
-    obstacle = np.sin(4 * np.pi * h * np.arange(n) - np.pi / 6) / 2 - 2
-    return A, -30 * h**2 * inside, obstacle * inside
 
 
 def test_a_step_of_a_model_below_the_operator_is_shortened(minimise):

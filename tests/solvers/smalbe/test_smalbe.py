@@ -364,8 +364,8 @@ def test_M_shrinks_while_the_lagrangian_grows_too_little(outer_loop, dual, seed)
     assert False in cut
 
 
-@pytest.mark.parametrize("rho", [1e-3, 3.0])
-def test_the_carried_gradient_is_the_gradient(outer_loop, dual, rho):
+@pytest.mark.parametrize(("rho", "rounding"), [(1e-3, 1e-12), (3.0, 1e-13)])
+def test_the_carried_gradient_is_the_gradient(outer_loop, dual, rho, rounding):
     """This includes changes of the penalty."""
     problem = projected(dual(271828))
     end = outer_loop(problem, M=10.0, rho=rho, tol=1e-6)
@@ -374,7 +374,7 @@ def test_the_carried_gradient_is_the_gradient(outer_loop, dual, rho):
     assert end.rho > rho
 
     fresh = hessian(problem, end.rho) @ end.nu - problem.b + C.T @ end.mu
-    assert end.g == pytest.approx(fresh, abs=1e-12)
+    assert end.g == pytest.approx(fresh, abs=rounding)
 
 
 def test_the_projected_problem_is_normalised_and_projected(dual):
@@ -473,15 +473,14 @@ def test_every_combination_of_rules_solves(
         (4, 3, 1, (46, 56)), (4, 3, 10, (54, 73)),
         (12, 6, 5, (59, 84)), (12, 6, 10, (72, 103)), (12, 7, 10, (58, 87)),
         pytest.param(30, 15, 1, (57, 90), marks=pytest.mark.slow),
-        pytest.param(30, 15, 5, (60, 91), marks=pytest.mark.slow),
+        pytest.param(30, 15, 5, (58, 91), marks=pytest.mark.slow),
         pytest.param(30, 15, 10, (67, 107), marks=pytest.mark.slow),
         pytest.param(60, 30, 5, (64, 105), marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
     """The products of PERMON were measured on these QPs with its best setting at 1e-6
-    and 1e-8; the stopping criterion is recomputed from the QP. One limit is 0.52 of
-    PERMON's products, as docs/performance.md states.
+    and 1e-8; the stopping criterion is recomputed from the QP.
     """
     family = PROBLEMS["beam-ring"]
     configured = family.with_keys(Nr=Nr, Nh=Nh, step=step)

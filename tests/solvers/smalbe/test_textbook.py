@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.sparse import csc_array
 from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness import QP, Discs, Status
@@ -23,6 +22,7 @@ from mortarbench.solvers.smalbe.textbook import (
 )
 from tests.solvers.smalbe.test_hostile import ends
 from tests.support.discs import qp_on_discs
+from tests.support.permon import string
 
 NAMES = ["smalbe-textbook", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
 
@@ -42,20 +42,6 @@ def minimise(A, b, lower, upper=None, *, alpha_bar, tol=1e-12, options=None):
         alpha_bar=alpha_bar, stop=lambda x, gradient: gradient <= tol, max_steps=1000,
     )  # fmt: skip
     return run, len(products)
-
-
-def string():
-    """Return matrix, load and obstacle of the string of PERMON's first tutorial.
-
-    The string has 100 points and lies above a sine-shaped obstacle.
-    """
-    n, h = 100, 1 / 99
-    A = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
-    A[[0, -1]], A[:, [0, -1]] = 0, 0
-    A[[0, -1], [0, -1]] = 1
-    inside = np.r_[0, np.ones(n - 2), 0]
-    obstacle = np.sin(4 * np.pi * h * np.arange(n) - np.pi / 6) / 2 - 2
-    return csc_array(A), -30 * h**2 * inside, obstacle * inside
 
 
 @pytest.mark.parametrize(
