@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from mortarbench.harness.errors import InputError, unknown
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.reports.answer import decisive, rows, sentence
 from mortarbench.reports.export.records import plain, write_csv, write_parquet
 from mortarbench.reports.figures.curves import against
 from mortarbench.reports.measurements import Measurements, read_measurements
@@ -44,9 +43,10 @@ def write_report(
             raise unknown("report format", name, FORMATS)
     run = read_measurements(directory, factor)
     target = directory / "report"
-    written = []
+    written: list[Path] = []
+    document = compose(run)
     if {"html", "md", "tex", "csv"} & set(formats):
-        written += write_document(compose(run), target, formats)
+        written += write_document(document, target, formats)
     if {"csv", "parquet"} & set(formats):
         stored = run if factor == VERIFIED_FACTOR else read_measurements(directory)
         frame = plain(stored.df)
@@ -54,11 +54,8 @@ def write_report(
             written.append(write_csv(target / "tables" / "measurements.csv", frame))
         if "parquet" in formats:
             written.append(write_parquet(target / "records.parquet", frame))
-    said = [
-        sentence(row)
-        for digest in dict.fromkeys(run.df.environment)
-        for row in decisive(list(rows(run.only(environment=digest))))
-    ]
+    answers = [part for part in document.sections if part.name.startswith("answer")]
+    said = [item for part in answers for item in part.items if isinstance(item, str)]
     return written, said
 
 
