@@ -255,6 +255,10 @@ def latex(tables: Sequence[Table], *, intervals: bool = True) -> str:
     return "\n".join(_tex_table(table, intervals) for table in tables)
 
 
+#: invisible line of 9 pt type that keeps a row away from the rule above it
+_STRUT = r"\rule{0pt}{2.5ex}"
+
+
 def _tex_table(table: Table, intervals: bool) -> str:
     lines = []
     for row in table.rows:
@@ -264,17 +268,19 @@ def _tex_table(table: Table, intervals: bool) -> str:
             small = [rf"{{\scriptsize {_tex(b)}}}" if b else "" for b in parts]
             lines.append(" & ".join(small) + r" \\")
         lines[-1] += "[2pt]"
+    head = " & ".join(map(_tex, table.head)) + r" \\[2pt]"
     columns = "l" * table.texts + "r" * (len(table.head) - table.texts)
     return "\n".join(
         [
             r"\begin{table}",
             r"  \centering\small\setlength{\tabcolsep}{3pt}",
             rf"  \caption{{{_tex(table.caption)}}}\label{{tab:{table.name}}}",
+            r"  \par\smallskip",
             rf"  \begin{{tabular}}{{@{{}}{columns}@{{}}}}",
             r"    \hline",
-            "    " + " & ".join(map(_tex, table.head)) + r" \\",
+            f"    {_STRUT}{head}",
             r"    \hline",
-            *(f"    {line}" for line in lines),
+            *(f"    {_STRUT * (k == 0)}{line}" for k, line in enumerate(lines)),
             r"    \hline",
             r"  \end{tabular}",
             r"\end{table}",

@@ -32,7 +32,12 @@ from mortarbench.reports.document import (
 )
 from mortarbench.reports.figures import curves
 from mortarbench.reports.intervals import median_interval, power_law
-from mortarbench.reports.measurements import CELL, Measurements, series_of
+from mortarbench.reports.measurements import (
+    CELL,
+    Measurements,
+    in_order,
+    series_of,
+)
 
 GROUPS = {
     "verified": (Verdict.VERIFIED, *PROVEN),
@@ -357,7 +362,7 @@ def accuracy(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         error=("error", "median"), largest=("error", "max"),
     )  # fmt: skip
     tolerances = sorted(set(answers.tol), reverse=True)
-    rows_of = dict.fromkeys((form, s) for form, s, _ in data.index)
+    rows_of = {(form, s) for form, s, _ in data.index}
     yield Table(
         name="accuracy",
         head=("form", "solver", *(f"tol {tolerance(t)}" for t in tolerances)),
@@ -367,7 +372,9 @@ def accuracy(run: Measurements, rows: list[Row]) -> Iterator[Item]:
                 short_name(s),
                 *(_accuracy(data, (form, s, t)) for t in tolerances),
             )
-            for form, s in sorted(rows_of, key=lambda key: run.solvers.index(key[1]))
+            for form in in_order(answers.form, ("primal", "dual"))
+            for s in run.solvers
+            if (form, s) in rows_of
         ),
         caption="Error of the verified answers, relative to the solution in the energy "
         "norm (certified bound where the case has mechanics): median over the cases. "
