@@ -1,4 +1,4 @@
-"""Tables of docs/smalbe-discs.md: products of in-house solvers on Mindlin's problem.
+"""Tables of docs/performance.md on discs: solvers on Mindlin's problem.
 
     python -m benchmarks.discs products|ratios|time|conic
 
