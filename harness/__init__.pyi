@@ -13,6 +13,7 @@ from .plugin import Case as Case
 from .plugin import CaseOnRanks as CaseOnRanks
 from .plugin import Chained as Chained
 from .plugin import ContactSide as ContactSide
+from .plugin import Divided as Divided
 from .plugin import Family as Family
 from .plugin import Fields as Fields
 from .plugin import Reference as Reference

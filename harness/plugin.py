@@ -281,6 +281,14 @@ class CaseOnRanks(NamedTuple):
     case: Callable[[], Case]
 
 
+class Divided(NamedTuple):
+    """The subdomains of a case."""
+
+    subdomains: int  #: number of subdomains, which is the largest number of ranks
+    #: builds the case; all ranks call this function together
+    build: Callable[[Comm, ReferenceOfOperator], CaseOnRanks]
+
+
 class Family(ABC):
     """A parametrised family of problems: a frozen dataclass whose fields are its keys.
 
@@ -352,16 +360,9 @@ class Family(ABC):
         """Return the paths of the problems in an input file, such as PATH#1, PATH#2."""
         return [path]
 
-    def subdomains(self, form: str) -> int:
-        """Return the largest number of ranks that can build the case together."""
-        return 1
+    def divided(self, form: str) -> Divided | None:
+        """Return the subdomains of a form, or None if it is not in subdomains.
 
-    def on_ranks(
-        self, form: str
-    ) -> Callable[[Comm, ReferenceOfOperator], CaseOnRanks] | None:
-        """Return a function that builds the case on several ranks, or None.
-
-        All ranks call the returned function together. None means that a single process
-        builds the QP. This method does not build the QP and does not need MPI.
+        This method does not build the QP and does not need MPI.
         """
         return None

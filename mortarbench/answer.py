@@ -317,8 +317,9 @@ def solve(
     spec = SolverSpec(name=name, label=name, options=requested).on(ranks)
     parts = ranks
     if ranks > 1:
-        divided = as_case(case, registries=registries).id
-        parts = divided.family.subdomains(divided.form)
+        named = as_case(case, registries=registries).id
+        divided = named.family.divided(named.form)
+        parts = 1 if divided is None else divided.subdomains
     with ExitStack() as stack:
         worker = None
         if parts >= ranks:
@@ -372,10 +373,7 @@ def _measured(
     from mortarbench.harness.processes.protocol import Source
     from mortarbench.verification import remarks
 
-    source = Source.FILE
-    if record.ranks > 1:
-        own = problem.registries.hold_only_builtins()
-        source = Source.RANKS if own else Source.SHARES
+    own = problem.registries.hold_only_builtins()
     # Code of a family may print, and standard output is reserved for the answer
     with one_thread(), redirect_stdout(stderr):
         record, solution = measure_once(
@@ -383,7 +381,7 @@ def _measured(
             lambda: problem.family_case,
             record,
             problem.registries.reference,
-            source=source,
+            source=Source.of(record, own_code_only=own),
             time_limit=time_limit,
         )
         # remarks on the input are known only if this process has built the case

@@ -1,13 +1,14 @@
-"""Main functions of the processes of a run: the worker, also on MPI ranks."""
+"""Main function of the processes of a run: the worker, also on MPI ranks."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mortarbench.harness.distributed.comm import Comm
+from mortarbench.harness.distributed.comm import RECORD, Comm
 from mortarbench.harness.distributed.mpi import too_few_parts
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.names import assemble
@@ -22,20 +23,22 @@ from mortarbench.registries import Registries, with_history
 
 
 def worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Run a worker; called by the commands of `Registries`.
+    """Run a worker, on one process or on ranks; called by commands of `Registries`.
 
     arguments : a JSON object, and the file descriptors for requests and replies. The
-        worker measures a solver if the object contains its ``name``
+        worker measures a solver if the object contains its specification
     """
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
+    ranks = request.get("solver", {}).get("ranks", 1)
+    if ranks > 1 and RECORD not in os.environ:  # not started by mpiexec
+        return launch(ranks, [*registries.start, "worker", *arguments])
     registries = registries.with_files(request["plugins"])
     solver = None
-    if "name" in request:
-        name, solvers = request["name"], registries.solvers
+    if "solver" in request:
+        spec, solvers = SolverSpec(**request["solver"]), registries.solvers
         if "copy" in request:
-            solvers = {name: read_solver(Path(request["copy"]))}
-        spec = SolverSpec(name=name, label=name, options=request["options"])
+            solvers = {spec.name: read_solver(Path(request["copy"]))}
         spec = typed(spec, solvers)
         if request["records"]:
             spec = with_history(spec, solvers)
@@ -48,25 +51,16 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         case_id = assemble(
             name, registries.families[name], case["params"], case["form"]
         )
-        on_ranks = case_id.family.on_ranks(case_id.form)
-        if on_ranks is None:
-            raise InputError(too_few_parts(1, comm.size))
-        return on_ranks(comm, reference_of_operator)
+        parts = case_id.family.divided(case_id.form)
+        if parts is None or parts.subdomains < comm.size:
+            count = 1 if parts is None else parts.subdomains
+            raise InputError(too_few_parts(count, comm.size))
+        return parts.build(comm, reference_of_operator)
 
     work = Worker(
         solver=solver,
         cases=Cases(registries.families, registries.reference),
         operators=registries.operators,
     )
-    is_parallel = request.get("ranks", 1) > 1
-    serve(work, int(request_fd), int(reply_fd), build if is_parallel else None)
+    serve(work, int(request_fd), int(reply_fd), build if ranks > 1 else None)
     return 0
-
-
-def ranks(registries: Registries, arguments: Sequence[str]) -> int:
-    """Start a worker on several MPI ranks; called by the command of `worker_command`.
-
-    arguments : see `worker`
-    """
-    count = json.loads(arguments[0])["ranks"]
-    return launch(count, [*registries.start, "worker", *arguments])

@@ -247,18 +247,14 @@ class Registries:
 
         """
         request: dict[str, Any] = {
-            "name": spec.name,
-            "options": spec.options if copy is None else {},
+            "solver": vars(spec if copy is None else replace(spec, options={})),
             "plugins": self._absolute_files(spec.name.partition(":")[0]),
             "records": records,
         }
         if copy is not None:
             request["copy"] = str(copy)
-        if spec.ranks > 1:
-            request["ranks"] = spec.ranks
-        name = "ranks" if spec.ranks > 1 else "worker"
         try:
-            return [*self.start, name, json.dumps(request)]
+            return [*self.start, "worker", json.dumps(request)]
         except TypeError:
             raise InputError(
                 f"{spec.name}: options {shown(dict(spec.options))}; expected numbers, "

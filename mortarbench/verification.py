@@ -140,8 +140,7 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
             "a smaller tolerance may give a smaller bound"
         )
     # An exception in a remark must not make the solve fail. Displacements may be
-    # recovered by code of a plug-in, and if MPI ranks solved the QP, the case is not
-    # built in this process.
+    # recovered by code of a plug-in, and the case may not yet be built here.
     with suppress(Exception), one_thread():
         if _is_open(case, record, solution):
             reasons.append(

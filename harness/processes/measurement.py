@@ -42,7 +42,7 @@ class JudgedMeasurement(NamedTuple):
     record: Record
     #: answer of the solver; None if the worker ended without an answer
     solution: Solution | None
-    #: False if the ranks that solved the QP have computed quantities and error bounds
+    #: False if the worker has computed quantities and error bounds
     needs_evaluation: bool = True
 
 
@@ -57,7 +57,7 @@ def measure_and_judge(
 ) -> JudgedMeasurement:
     """Measure once with a worker process, and complete `record` with costs and verdict.
 
-    whole : returns the QP; not called if ranks build the QP and judge the answer
+    whole : returns the QP; not called if the worker judges the answer
     request : request to the worker, see `harness.processes.worker`; the tolerance and
         the memory limit are added. The worker writes the point to the file ``out``. If
         the worker ends in a repetition of a completed solve, the QP is solved and timed
@@ -76,7 +76,7 @@ def measure_and_judge(
     if not isinf(memory_limit):
         request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
-    out, by_ranks = Path(request["out"]), source_of(request) is Source.RANKS
+    out, source = Path(request["out"]), source_of(request)
     try:
         out.unlink(missing_ok=True)
         ask = partial(worker.ask, time_limit=time_limit, memory_limit=memory_limit)
@@ -93,7 +93,7 @@ def measure_and_judge(
             threads=reply.threads,
             cpu=reply.cpu,
         )
-        if not by_ranks:
+        if source.needs_case:
             qp = whole()
             record = record.replace(sizes=qp.sizes)
         elif reply.built is not None:
@@ -112,26 +112,26 @@ def measure_and_judge(
     except OSError as e:
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
-    cost, more = _cost(reply, record.ranks)
+    cost, more = _cost(reply, source)
     record = record.replace(**cost)
-    if by_ranks:
+    if source.needs_case:
+        record = judged(record, qp, solution)
+    else:
         fields = dict(reply.answer["fields"])
         fields["status"] = Verdict(fields["status"])
         record = claimed(record, solution).replace(**fields)
         more += reply.answer["notes"]
-    else:
-        record = judged(record, qp, solution)
     record = _check_memory(memory_limit, noted(record, reply.message, *notes, *more))
-    return JudgedMeasurement(record, solution, needs_evaluation=not by_ranks)
+    return JudgedMeasurement(record, solution, needs_evaluation=source.needs_case)
 
 
 def case_request(record: Record) -> dict[str, Any]:
-    """Return the entry of a request that specifies the case that the ranks build."""
+    """Return the entry of a request that specifies the case that the worker builds."""
     case = {"family": record.family, "params": dict(record.params), "form": record.form}
     return {"case": case}
 
 
-def _cost(reply: Reply, ranks: int) -> tuple[dict[str, Any], list[str]]:
+def _cost(reply: Reply, source: Source) -> tuple[dict[str, Any], list[str]]:
     """Return the cost of a measurement as fields of its record, and notes.
 
     Times that exceed the time on the parent's clock are replaced by the latter.
@@ -148,7 +148,7 @@ def _cost(reply: Reply, ranks: int) -> tuple[dict[str, Any], list[str]]:
         )
     if cost.get("remembered"):
         notes.append(REMEMBERED_NOTE)
-    if ranks > 1:  # rank 0 measures only its own memory, the parent that of all ranks
+    if source.is_shared:  # the worker measures only the memory of its own process
         cost["peak_mib"] = reply.peak_mib
     return cost, notes
 
@@ -184,8 +184,7 @@ def measure_once(
     case : returns the case; the first call builds it
     reference : reference solver, called if the residuals alone do not decide the
         verdict
-    source : origin of the QP. For `Source.RANKS`, the ranks judge their answer
-        themselves, and the case is not built
+    source : origin of the QP; the case is not built unless `Source.needs_case`
     time_limit : limit of the solve, in s
 
     Raises
@@ -198,7 +197,7 @@ def measure_once(
         request: dict[str, Any] = {"out": str(scratch / "point.npz"), "source": source}
         if source.is_shared:
             request |= case_request(record)
-        if source is not Source.RANKS:
+        if source.needs_case:
             qp_file = scratch / "qp.npz"
             meta = {"name": record.case}
             saved = save_qp(qp_file, case().qp, meta, serialised=True)

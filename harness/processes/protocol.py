@@ -30,7 +30,7 @@ from enum import StrEnum
 from typing import Any
 
 from mortarbench.harness.errors import one_line, shortened
-from mortarbench.harness.record import finite
+from mortarbench.harness.record import Record, finite
 
 #: size of the largest reply that is read, which bounds the required memory
 MAX_REPLY_BYTES = 2**22
@@ -113,10 +113,25 @@ class Source(StrEnum):
     #: MPI ranks build the QP together, and rank 0 judges the answer
     RANKS = "ranks"
 
+    @classmethod
+    def of(cls, record: Record, *, own_code_only: bool) -> Source:
+        """Return the origin of the QP of a record.
+
+        own_code_only : False if code of plug-ins may run on the ranks
+        """
+        if record.ranks == 1:
+            return cls.FILE
+        return cls.RANKS if own_code_only else cls.SHARES
+
     @property
     def is_shared(self) -> bool:
         """True if MPI ranks build the QP."""
         return self is not Source.FILE
+
+    @property
+    def needs_case(self) -> bool:
+        """True if the parent builds the case and judges the answer."""
+        return self is not Source.RANKS
 
 
 def source_of(request: Mapping[str, Any]) -> Source:

@@ -12,7 +12,7 @@ The process follows `harness.processes.protocol` and answers these requests:
   - ``step``: index 0, 1, … of the QP in a sequence
 
 * ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: build a case on the MPI ranks
-  (`harness.plugin.Family.on_ranks`), measure, and write the point to ``out``. If
+  (`harness.plugin.Family.divided`), measure, and write the point to ``out``. If
   ``source`` is "ranks", the ranks also judge the answer at the tolerance ``judged_at``.
   The event ``built`` contains the fields ``sizes``, ``qp`` and ``build_seconds`` of
   the record; the event ``measured`` is sent when the point has been written

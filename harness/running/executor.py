@@ -114,8 +114,7 @@ class Executor:
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
 
-        If ranks build a QP and execute no plug-in code, the ranks also judge the
-        answer. The case is then not built.
+        The case is built first, unless the worker itself builds and judges.
 
         Raises
         ------
@@ -123,10 +122,10 @@ class Executor:
             If the harness or the machine failed.
 
         """
-        source = self._source(turn[0])
-        if source is not Source.RANKS:
+        source = Source.of(turn[0], own_code_only=self.commands.own_code_only)
+        if source.needs_case:
             self._build(turn)
-        count = len(turn) if source is Source.RANKS else len(self._entries)
+        count = len(self._entries) if source.needs_case else len(turn)
         ended: Record | None = None
         for step, record in enumerate(turn):
             if step >= count:
@@ -146,7 +145,7 @@ class Executor:
                     ended = result.record
                 yield result
         if block.is_sequence and source.is_shared:
-            self._worker(turn[0].solver).close()  # ranks remain between steps only
+            self._worker(turn[0].solver).close()  # it remains between steps only
 
     def _measure(
         self, block: WorkUnit, turn: tuple[Record, ...], step: int, source: Source
@@ -158,7 +157,7 @@ class Executor:
             request["step"] = step
         if source.is_shared:
             request |= case_request(record)
-        if source is not Source.RANKS:
+        if source.needs_case:
             entry = self._entries[step]
             keys = ("qp", "build_seconds", "dualise_seconds")
             record = record.replace(**{key: entry.meta.get(key) for key in keys})
@@ -184,12 +183,6 @@ class Executor:
         if needs_evaluation:
             return self._describe(record, solution)
         return Result(record=record, point=point_arrays(solution))
-
-    def _source(self, record: Record) -> Source:
-        """Return the origin of a record's QP."""
-        if record.ranks == 1:
-            return Source.FILE
-        return Source.RANKS if self.commands.own_code_only else Source.SHARES
 
     def _build(self, turn: tuple[Record, ...]) -> None:
         """Build the cases of the current block, unless they are already built.

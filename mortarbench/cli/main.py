@@ -79,12 +79,11 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
 
 def _run(registries: Registries, argv: Sequence[str]) -> int:
     registries = installed(registries)
-    if argv[:1] in (["worker"], ["ranks"]):  # processes of a run
+    if argv[:1] == ["worker"]:  # a process of a run
         defer_parts_of_numpy()
-        from mortarbench import processes
+        from mortarbench.processes import worker
 
-        start = processes.worker if argv[0] == "worker" else processes.ranks
-        return start(registries, argv[1:])
+        return worker(registries, argv[1:])
     if "_ARGCOMPLETE" in os.environ:  # set by the script of `completion`
         from mortarbench.cli.completion import complete
 

@@ -1,7 +1,7 @@
 """Arguments of commands, read from the signatures and docstrings of their functions.
 
 Every bool and `Literal` parameter of a function is an argument of its command, and so
-is every parameter annotated with a text: ``Annotated[int, "--mpi --ranks N"]``. The
+is every parameter annotated with a text: ``Annotated[str, "--solver NAME"]``. The
 text contains the name of the value in help texts and, where they differ from the name
 of the parameter, the names of the option. Parameters without a default are positional
 unless they are keyword-only. An option for a sequence may be repeated; it is a list

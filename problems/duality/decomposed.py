@@ -161,15 +161,15 @@ def cached_layout(bodies: ElasticBodies, size: int) -> Subdivision:
 
 
 def case_on_ranks(
-    comm: Comm, problem: ContactProblem, choice: Choice, reference: ReferenceOfOperator
+    problem: ContactProblem, choice: Choice, comm: Comm, reference: ReferenceOfOperator
 ) -> CaseOnRanks:
     """Return the selected dual of decomposed bodies; all ranks call this together.
 
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks, or if the fixed-point iteration for
-        Coulomb's law does not converge.
+        If displacements are prescribed, or if the fixed-point iteration for Coulomb's
+        law does not converge.
 
     """
     if problem.bodies.lift is not None:

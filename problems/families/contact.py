@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache, partial
 from typing import Any, Self
 
 from mortarbench.harness import (
     Case,
-    CaseOnRanks,
+    Divided,
     Family,
     InputError,
     Reference,
-    ReferenceOfOperator,
     Solution,
 )
-from mortarbench.harness.distributed.comm import Comm
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.case_forms import case_of
@@ -139,25 +137,15 @@ class ContactFamily(NewtonFamily):
             getattr(self, "step", 1), size, getattr(self, "glue", "orthonormal")
         )
 
-    def subdomains(self, form: str) -> int:
-        """Return the number of subdomains, or 1 for undivided bodies."""
-        if form != "dual" or not (size := self.choice(form).size):
-            return 1
-        from mortarbench.problems.duality.decomposed import cached_layout
-
-        return cached_layout(self.contact_problem().bodies, size).count
-
-    def on_ranks(
-        self, form: str
-    ) -> Callable[[Comm, ReferenceOfOperator], CaseOnRanks] | None:
-        """Return a function that builds the case on several ranks, or None."""
+    def divided(self, form: str) -> Divided | None:
+        """Return the subdomains of a form, or None for undivided bodies."""
         if form != "dual" or not (choice := self.choice(form)).size:
             return None
-        from mortarbench.problems.duality.decomposed import case_on_ranks
+        from mortarbench.problems.duality.decomposed import cached_layout, case_on_ranks
 
-        return lambda comm, reference: case_on_ranks(
-            comm, self.contact_problem(), choice, reference
-        )
+        problem = self.contact_problem()
+        count = cached_layout(problem.bodies, choice.size).count
+        return Divided(count, partial(case_on_ranks, problem, choice))
 
 
 @lru_cache(maxsize=4)

@@ -22,19 +22,17 @@ from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 from mortarbench.harness import (
     QP,
     Case,
-    CaseOnRanks,
+    Divided,
     Family,
     Fields,
     Grid,
     InputError,
     Mechanics,
     Reference,
-    ReferenceOfOperator,
     Solution,
     Vector,
     no_rows,
 )
-from mortarbench.harness.distributed.comm import Comm
 from mortarbench.harness.keys import Range
 from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.sides import active
@@ -81,7 +79,7 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.mechanics import torn_mechanics
-from mortarbench.problems.feti.served import Served
+from mortarbench.problems.feti.served import Served, case_of_torn
 from mortarbench.problems.feti.spectrum import Spectrum, spectra
 from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
@@ -164,25 +162,13 @@ class DecomposedFamily(Family):
             matrices=feti_matrices(served, new.qp),
         )
 
-    def subdomains(self, form: str) -> int:
-        """Return the number of subdomains, or 1 for undivided bodies."""
-        if self.on_ranks(form) is None:
-            return 1
-        return int(self.in_subdomains().layout.count)
-
-    def on_ranks(
-        self, form: str
-    ) -> Callable[[Comm, ReferenceOfOperator], CaseOnRanks] | None:
-        """Return a function that builds the case on several ranks, or None."""
+    def divided(self, form: str) -> Divided | None:
+        """Return the subdomains of a form, or None if it is not in subdomains."""
         if form != "dual" or not self.is_divided:
             return None
-
-        def build(comm: Comm, reference: ReferenceOfOperator) -> CaseOnRanks:
-            del reference
-            served = Served(TornBodies(self.in_subdomains(), comm))
-            return CaseOnRanks(served, partial(self.decomposed_case, served))
-
-        return build
+        problem = self.in_subdomains()
+        build = partial(case_of_torn, problem, self.decomposed_case)
+        return Divided(problem.layout.count, build)
 
 
 HALF_WIDTH = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω for each shape, m

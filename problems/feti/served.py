@@ -11,14 +11,14 @@ from typing import Any, cast
 import numpy as np
 from scipy.sparse.linalg import LinearOperator
 
-from mortarbench.harness import Vector
-from mortarbench.harness.distributed.comm import Lead
+from mortarbench.harness import Case, CaseOnRanks, ReferenceOfOperator, Vector
+from mortarbench.harness.distributed.comm import Comm, Lead
 from mortarbench.harness.mechanics import Substructures
 from mortarbench.harness.operators import Product, SerialisableOperator
 from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import DualOperator, explicit_classes
 from mortarbench.problems.feti.subdomain_classes import Dense, Subdomains
-from mortarbench.problems.feti.subdomains import TornBodies
+from mortarbench.problems.feti.subdomains import DecomposedProblem, TornBodies
 from mortarbench.problems.feti.substructures import LocalProblems
 
 
@@ -80,6 +80,20 @@ class Served:
     def forget(self) -> None:
         """Discard the factors of the dual operator."""
         vars(self).pop("operator", None)
+
+
+def case_of_torn(
+    problem: DecomposedProblem,
+    case: Callable[[Served], Case],
+    comm: Comm,
+    _: ReferenceOfOperator,
+) -> CaseOnRanks:
+    """Return a case that needs no previous solutions; all ranks call this together.
+
+    case : returns the case on rank 0
+    """
+    served = Served(TornBodies(problem, comm))
+    return CaseOnRanks(served, partial(case, served))
 
 
 def operator_of(served: Served) -> SerialisableOperator | OperatorOnRanks:

@@ -36,9 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
-from mortarbench.harness import InputError, Vector
+from mortarbench.harness import Vector
 from mortarbench.harness.distributed.comm import SERIAL, Comm
-from mortarbench.harness.distributed.mpi import too_few_parts
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.subdivision import (
     Integers,
@@ -280,15 +279,9 @@ def subdomain_ranks(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]
     Products with the dual operator sum whole vectors, so that the ranks need not have
     few common rows. The work of a product and the number of nodes are balanced.
 
-    Raises
-    ------
-    InputError
-        If there are fewer subdomains than ranks.
-
+    ranks : number of ranks, at most S
     """
     of, S = problem.layout, problem.layout.count
-    if S < ranks:
-        raise InputError(too_few_parts(S, ranks))
     touched = of.glued()
     d = problem.components
     node = np.unique(np.concatenate([problem.fixed, problem.contact.rows.indices]) // d)

@@ -1,4 +1,4 @@
-"""Figures of curves: times, scaling, profiles, iterations, accuracy, routes, ranks."""
+"""Figures of curves: times, scaling, profiles, iterations, accuracy, routes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from mortarbench.harness.solution import History
 from mortarbench.reports.answer import Row
-from mortarbench.reports.document import tolerance
 from mortarbench.reports.figures.style import (
     COLOURS,
     INK,
@@ -24,7 +23,6 @@ from mortarbench.reports.figures.style import (
     panels,
     styled,
 )
-from mortarbench.reports.intervals import median_interval
 
 MOST_PANELS = 4  #: largest number of panels of one figure
 #: step types of SMALBE by letter, with their markers in histories
@@ -39,7 +37,6 @@ AXES = {
     "error": "relative error",
     "residual": "largest relative residual",
     "memory": "peak memory in MiB",
-    "ranks": "ranks",
 }
 
 
@@ -203,33 +200,6 @@ def routes(answers: pd.DataFrame, y: str = "mesh_seconds") -> Figure:
             logarithmic(one)
         axes[0].set_ylabel(AXES.get(y, y))
         legend(figure, axes, 3)
-    return figure
-
-
-def ranks(df: pd.DataFrame) -> Figure:
-    """Plot the solve time against the number of ranks, with intervals of the medians.
-
-    df : verified measurements with the column `base`, the solver without its ranks
-    """
-    groups = list(df.groupby(["case", "tol", "base"], sort=False))[:9]
-    with styled():
-        figure, (one,) = panels(1)
-        for k, ((case, tol, base), of) in enumerate(groups):
-            medians = {
-                n: median_interval(t.solve_seconds) for n, t in of.groupby("ranks")
-            }
-            values = list(medians.values())
-            curve(
-                one, list(medians), [v.value for v in values],
-                ([v.low for v in values], [v.high for v in values]),
-                color=COLOURS[k], marker=MARKERS[k],
-                label=legible(f"{base}, {case}, {tolerance(tol)}", 64),
-            )  # fmt: skip
-        one.set(xlabel="ranks", ylabel="solve time in s")
-        logarithmic(one)
-        counts = sorted(set(df.ranks))
-        one.set_xticks(counts, [str(n) for n in counts])
-        legend(figure, [one], 1)
     return figure
 
 

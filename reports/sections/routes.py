@@ -237,9 +237,3 @@ def ranks(run: Measurements, rows: list[Row]) -> Iterator[Item]:
         "memory of all ranks relative to one rank.",
         texts=2,
     )  # fmt: skip
-    yield Picture(
-        name="ranks",
-        caption="Solve time against the number of ranks; bars: 95 % intervals of the "
-        "medians.",
-        draw=partial(curves.ranks, df),
-    )

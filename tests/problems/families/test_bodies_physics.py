@@ -108,7 +108,7 @@ def test_prescribed_displacements_on_ranks_are_refused(column):
     more = BASE + '[[supports]]\nboundary = "top"\ndisplacement = ["free", -0.004]\n'
     column(more)
     case = parse("bodies:a.toml/parts=4/dual", PROBLEMS)
-    build = case.family.on_ranks(case.form)
+    build = case.family.divided(case.form).build
     with pytest.raises(InputError, match="displacements on MPI ranks are not built"):
         build(SERIAL, reference_of_operator)
 

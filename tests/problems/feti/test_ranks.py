@@ -9,7 +9,6 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csr_array, issparse
 
-from mortarbench.harness import InputError
 from mortarbench.harness.distributed.comm import SERIAL, led
 from mortarbench.harness.mechanics import Real
 from mortarbench.harness.names import parse
@@ -49,8 +48,7 @@ def ranks_do_not_lock_one_another_out():
 def built(name, comm):
     """Build a case on ranks; return its objects on this rank, and the case."""
     case = parse(f"{name}/dual", PROBLEMS)
-    build = case.family.on_ranks(case.form)
-    return build(comm, reference_of_operator)
+    return case.family.divided(case.form).build(comm, reference_of_operator)
 
 
 def facts(made, s):
@@ -164,8 +162,7 @@ def test_the_digest_is_that_of_the_case_without_ranks(name):
 )  # fmt: skip
 def test_cases_without_subdomains_are_not_built_on_ranks(name):
     case = parse(name, PROBLEMS)
-    assert case.family.on_ranks(case.form) is None
-    assert case.family.subdomains(case.form) == 1
+    assert case.family.divided(case.form) is None
 
 
 def used(problem, size):
@@ -305,8 +302,6 @@ def test_nodes_of_supports_count_as_work_like_nodes_of_interfaces():
 def test_as_many_ranks_as_subdomains_have_one_subdomain_each():
     problem = subdomains([9, 9, 900, 9, 9], [5] * 5)
     assert subdomain_ranks(problem, 5).tolist() == list(range(5))
-    with pytest.raises(InputError, match="6 ranks for 5 subdomains; expected at most"):
-        subdomain_ranks(problem, 6)
 
 
 @pytest.mark.parametrize("ranks", [2, 3, 5])
