@@ -139,7 +139,8 @@ class Executor:
                 result = self._measure(block, turn, step, source)
                 # a failed step loses the solver's data for later steps
                 if (
-                    result.point is None
+                    block.is_sequence
+                    and result.point is None
                     and result.record.status is not Verdict.DECLINED
                 ):
                     ended = result.record
@@ -155,6 +156,8 @@ class Executor:
         request: dict[str, Any] = {"out": str(self._point), "source": source}
         if block.is_sequence:
             request["step"] = step
+        if len(turn) > 1:  # steps, whose times must not depend on the reuse of results
+            request["once"] = True
         if source.is_shared:
             request |= case_request(record)
         if source.needs_case:

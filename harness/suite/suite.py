@@ -105,9 +105,17 @@ class Suite:
 
     @property
     def groups(self) -> tuple[Group, ...]:
-        """Groups of cases that form a block: single cases, followed by sequences."""
+        """Groups of cases that form a block: single cases, followed by sequences.
+
+        If the steps of a sequence are also measured cold, they form one cold block, so
+        that both ways differ only in the reuse of results.
+        """
+        cold = {case.name for case in self.cases}
+        twice = [s for s in self.sequences if cold.issuperset(c.name for c in s)]
+        steps = {case.name for sequence in twice for case in sequence}
         return (
-            *(Group((case,), "cold") for case in self.cases),
+            *(Group((case,), "cold") for case in self.cases if case.name not in steps),
+            *(Group(steps, "cold") for steps in twice),
             *(Group(steps, "sequence") for steps in self.sequences),
         )
 

@@ -249,6 +249,22 @@ def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
     assert {r.iterations for r in records if r.solver == "honest"} == {1}
 
 
+def test_steps_listed_both_ways_are_solved_once_each_cold_and_warm(measure, tmp_path):
+    asked = three_steps("chains", "honest", repeats=2)
+    measure(replace(asked, cases=asked.sequences[0]))
+    records = read_journal(tmp_path)
+
+    assert len(records) == 2 * 2 * 2 * 3
+    assert {r.untimed for r in records} == {0}
+    for mode, expected in (("cold", [1, 1, 1]), ("sequence", [1, 2, 3])):
+        chain = [
+            r for r in records if (r.mode, r.solver, r.repeat) == (mode, "chains", 1)
+        ]
+        assert [r.params["h"] for r in chain] == [0.5, 1.0, 1.5]
+        assert [r.iterations for r in chain] == expected
+        assert len({r.block for r in chain}) == 1
+
+
 def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_path):
     cases = ({"h": 0.5}, {"h": 1.0}, {"fault": "end"}, {"fault": "end", "h": 0.5})
     names = tuple(assemble("tiny", FAMILIES["tiny"], case, "plain") for case in cases)
