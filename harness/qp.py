@@ -548,6 +548,8 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
     """Return a copy of a vector, which may also be a matrix with one row or column.
 
+    A vector of MATLAB without entries is a matrix without entries.
+
     name : name of the vector in messages
     n : expected number of entries; None for any number
 
@@ -558,7 +560,8 @@ def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
 
     """
     array = _numbers(name, value)
-    vector = array.ravel() if array.ndim == 2 and 1 in array.shape else array
+    is_flat = array.ndim == 2 and (1 in array.shape or not array.size)
+    vector = array.ravel() if is_flat else array
     if vector.ndim != 1 or (n is not None and vector.size != n):
         expected = "one dimension" if n is None else f"({n},)"
         raise InputError(f"{name} has shape {array.shape}; expected {expected}")

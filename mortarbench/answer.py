@@ -178,7 +178,9 @@ class Answer:
             If the answer has no point, or the file cannot be written.
 
         """
-        from mortarbench.harness.files.npz import write_mappable
+        import numpy as np
+
+        from mortarbench.harness.files.durable import writing
         from mortarbench.harness.files.store import POINT
 
         path = checked.output_file(path, ARCHIVES)
@@ -188,10 +190,8 @@ class Answer:
         if self.case.family_case.fields is not None:
             fields = self.fields()
             arrays |= {"points": fields.points, "displacements": fields.displacement}
-        try:
-            write_mappable(path, arrays)
-        except OSError as e:
-            raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+        with writing(path) as file:
+            np.savez(file, **arrays)
         return path
 
     def save_vtu(self, path: str | Path) -> Path:

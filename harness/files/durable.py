@@ -46,6 +46,16 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
         new.unlink(missing_ok=True)
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[IO[bytes]]:
+    """Open a new file with `replacing`; raise InputError if it cannot be written."""
+    try:
+        with replacing(path) as file:
+            yield file
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+
+
 def replace_file(path: Path, content: bytes) -> None:
     """Write `content` to a file with `replacing`; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -20,30 +20,30 @@ References
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csc_array, issparse
 
-from mortarbench.harness.errors import InputError, shortened
-from mortarbench.harness.files.datafile import (
-    check_size,
-    json_object,
-    max_bytes,
-    opened,
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.datafile import json_object, opened
+from mortarbench.harness.files.durable import writing
+from mortarbench.harness.files.isolated import read_isolated
+from mortarbench.harness.files.qpfile import (
+    csc_parts,
+    explicit_matrices,
+    listed_dense,
+    malformed,
+    qp_of,
 )
-from mortarbench.harness.files.durable import replacing
-from mortarbench.harness.files.qpfile import explicit_matrices, listed_dense
 from mortarbench.harness.qp import QP, Matrix, Vector
-from mortarbench.harness.sets.arrays import SET_ARRAY, further_sets, set_arrays
+from mortarbench.harness.sets.arrays import SET_ARRAY, set_arrays
 
 _MATRICES = ("P", "G", "A")
 _KEY = "mortarbench"
-_READER = Path(__file__).with_name("parquetreader.py")
 _COLUMNS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 _RIGHT_HAND_SIDE = {"G": "h", "A": "b"}
 #: Largest number of entries of a matrix, which occupy 1 GiB. Parquet stores a matrix as
@@ -87,11 +87,8 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     table = pa.table({**columns, "name": [str(meta.get("name", path.stem))]})
     text = json.dumps({**meta, "dense": dense})
     table = table.replace_schema_metadata({_KEY: text})
-    try:
-        with replacing(path) as file:
-            pq.write_table(table, file, compression="zstd")
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+    with writing(path) as file:
+        pq.write_table(table, file, compression="zstd")
 
 
 def load_parquet(path: Path, row: int | None = None) -> tuple[QP, dict[str, Any]]:
@@ -106,7 +103,7 @@ def load_parquet(path: Path, row: int | None = None) -> tuple[QP, dict[str, Any]
         columns do not define a valid QP.
 
     """
-    head, flat = _read_row(path, row or 1)
+    head, arrays = _read_row(path, row or 1)
     rows = head["rows"]
     if row is None and rows != 1:
         choice = f"{path}#1 or another row up to #{rows}" if rows else "one row"
@@ -117,26 +114,17 @@ def load_parquet(path: Path, row: int | None = None) -> tuple[QP, dict[str, Any]
         raise InputError(
             f"{path}: no column {', '.join(missing)}; expected the columns of a QP"
         )
-    check_size(f"{path}: its content", head["bytes"])
-    try:
-        meta = json_object(head["meta"])
-        dense = listed_dense(meta) if "dense" in meta else set(_MATRICES)
-        if odd := [name for name, count in head["columns"].items() if count == -1]:
+    with malformed(path):
+        if odd := [name for name, array in arrays.items() if not array.ndim]:
             raise ValueError(f"{odd[0]} is not a list of numbers")
-        if flat["P"] is None or flat["q"] is None:
+        if not {"P", "q"} <= arrays.keys():
             raise ValueError("P or q is null; expected lists of numbers")
-        parts: dict[str, Any] = {name: flat[name] for name in _COLUMNS}
-        for name in _MATRICES:
-            if parts[name] is not None:
-                M = _matrix(name, parts[name], flat["q"].size)
-                parts[name] = M if name in dense else csc_array(M)
-        sets = {name: part for name, part in flat.items() if SET_ARRAY.fullmatch(name)}
-        qp = QP.from_arrays(**parts, sets=further_sets(sets))
-    except (ValueError, TypeError, OverflowError) as e:
-        raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
-    except InputError as e:
-        raise InputError(f"{path}: {e}") from None
-    return qp, meta
+        meta = json_object(head["meta"])
+        dense = listed_dense(meta) if "dense" in meta else _MATRICES
+        for name in arrays.keys() & _MATRICES:
+            M = _matrix(name, arrays.pop(name), arrays["q"].size)
+            arrays |= {name: M} if name in dense else csc_parts(name, csc_array(M))
+        return qp_of({**arrays, "meta": np.array(head["meta"])})
 
 
 def count_problems(path: Path) -> int:
@@ -151,33 +139,13 @@ def count_problems(path: Path) -> int:
     return int(_read_row(path, 0)[0]["rows"])
 
 
-def _read_row(path: Path, row: int) -> tuple[dict[str, Any], dict[str, Vector | None]]:
-    """Read the head of a file, and the columns of a row, in a separate process.
-
-    A damaged file may crash Arrow; the separate process protects this process. If the
-    file does not have the row, lacks a column or is too large, there are no columns.
-
-    Raises
-    ------
-    InputError
-        If the file is not Parquet.
-
-    """
-    reader = [sys.executable, "-I", str(_READER)]
-    command = [*reader, str(max_bytes()), _KEY, SET_ARRAY.pattern, str(row), *_COLUMNS]
+def _read_row(path: Path, row: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read the head of a file, and the columns of a row, in a separate process."""
+    columns = (_KEY, SET_ARRAY.pattern, str(row), *_COLUMNS)
     with opened(path, "a Parquet file") as file:
-        done = subprocess.run(command, stdin=file, capture_output=True, check=False)
-    line, _, numbers = done.stdout.partition(b"\n")
-    if done.returncode or not line:
-        raise InputError(f"{path}: malformed; expected a Parquet file")
-    head = json.loads(line)
-    flat: dict[str, Vector | None] = {}
-    begin = 0
-    for name, count in head.get("columns", {}).items():
-        end = begin + 8 * max(count or 0, 0)
-        flat[name] = None if count is None else np.frombuffer(numbers[begin:end])
-        begin = end
-    return head, flat
+        wrong = "malformed; expected a Parquet file"
+        arrays = read_isolated(file, path, wrong, "parquet", *columns)
+    return json.loads(str(arrays.pop("head"))), arrays
 
 
 def _matrix(name: str, flat: Vector, n: int) -> Matrix:

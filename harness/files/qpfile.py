@@ -1,4 +1,4 @@
-"""QPs in npz files without pickles, for workers and for other programs.
+"""QPs in files: npz files without pickles, and files that workers map into memory.
 
 ::
 
@@ -17,6 +17,8 @@ Absent constraints have zero rows, and absent bounds are ±inf. The optional str
 a dual QP (`harness.qp.Structure`) is stored as the matrices ``K, B`` and the vector
 ``fixed``.
 
+Workers exchange the same arrays in the format of `harness.files.mapped`.
+
 Files written by ``np.savez(path, P=P, q=q, G=G, h=h)`` and by ``Problem.save`` of
 qpsolvers are also accepted. In these files, matrices are dense arrays or CSC parts, and
 ``G, h``, ``A, b``, bounds and sets are optional or None.
@@ -25,7 +27,8 @@ qpsolvers are also accepted. In these files, matrices are dense arrays or CSC pa
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -38,8 +41,9 @@ from scipy.sparse import csc_array, issparse
 
 from mortarbench.harness.errors import InputError, shortened, unknown
 from mortarbench.harness.files.datafile import check_size, json_object
-from mortarbench.harness.files.npz import write_mappable
-from mortarbench.harness.files.store import digest_of, mapped_arrays
+from mortarbench.harness.files.durable import writing
+from mortarbench.harness.files.mapped import read_mapped, write_mapped
+from mortarbench.harness.files.store import digest_of, read_arrays
 from mortarbench.harness.operators import Maker, SerialisableOperator, assembled
 from mortarbench.harness.qp import (
     QP,
@@ -50,12 +54,12 @@ from mortarbench.harness.qp import (
 )
 from mortarbench.harness.sets.arrays import SET_ARRAY, further_sets, set_arrays
 
-_VECTORS = ("q", "h", "b", "lb", "ub")
+VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
 _STRUCTURE = ("K", "B")
 _PARTS = ("data", "indices", "indptr", "shape")
 _INGREDIENT = "P_from_"  #: prefix of the arrays of a serialised operator P
-_PLAIN = {*_VECTORS, *_MATRICES} | {f"{M}_{part}" for M in _MATRICES for part in _PARTS}
+_PLAIN = {*VECTORS, *_MATRICES} | {f"{M}_{part}" for M in _MATRICES for part in _PARTS}
 
 
 def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
@@ -117,10 +121,11 @@ def save_qp(
     arrays, dense, maker = _parts(qp, serialised=serialised)
     digest = digest_of(arrays)
     arrays["meta"] = np.array(json.dumps({**meta, **maker, "dense": dense}))
-    try:
-        write_mappable(path, arrays)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    if serialised:
+        write_mapped(path, arrays)
+        return digest
+    with writing(path) as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
     return digest
 
 
@@ -148,16 +153,20 @@ def _parts(
 def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """Return the arrays to store for a QP, and the names of its dense matrices."""
     matrices, dense = explicit_matrices(qp)
-    arrays = {name: getattr(qp, name) for name in _VECTORS}
+    arrays = {name: getattr(qp, name) for name in VECTORS}
     arrays |= set_arrays(qp.sets[1:])
     if structure and qp.structure is not None:
         matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
         arrays["fixed"] = qp.structure.fixed
     for name, M in matrices.items():
-        M = csc_array(M)
-        parts = (M.data, M.indices, M.indptr, np.array(M.shape))
-        arrays |= {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
+        arrays |= csc_parts(name, csc_array(M))
     return arrays, dense
+
+
+def csc_parts(name: str, M: csc_array) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a matrix by their names in files."""
+    parts = (M.data, M.indices, M.indptr, np.array(M.shape))
+    return {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
 
 
 def load_qp(
@@ -165,26 +174,36 @@ def load_qp(
 ) -> tuple[QP, dict[str, Any]]:
     """Read a QP and its meta data.
 
-    operators : makers of operators by name (`harness.operators`), for a file that the
-        case worker of the same run has written. Such a file may contain an operator and
-        may have any size. None for a file of unknown origin, whose arrays are checked
-        like arguments of `QP.from_arrays`, and whose size is limited by
-        `harness.files.datafile`
+    operators : makers of operators by name (`harness.operators`), for a file that
+        `save_qp` has written with `serialised`. None for an npz file, whose size is
+        limited by `harness.files.datafile`
 
     Raises
     ------
     InputError
-        If the file is not an npz file, lacks an array, or its arrays do not define a
-        valid QP.
+        If the file cannot be read, lacks an array, or its arrays do not define a valid
+        QP.
 
     """
-    arrays = mapped_arrays(path, limited=operators is None)
-    try:
+    if operators is None:
+        arrays = read_arrays(path, ())
+        with malformed(path):
+            return qp_of(arrays)
+    with malformed(path):
+        try:
+            arrays = read_mapped(path)
+        except OSError as e:
+            raise InputError(e.strerror) from None
         meta = _meta(arrays)
-        if operators is None:
-            return _foreign_qp(arrays, meta), meta
-        return _own_qp(arrays, meta, operators), meta
-    except (ValueError, TypeError, OverflowError) as e:
+        return _serialised_qp(arrays, meta, operators), meta
+
+
+@contextmanager
+def malformed(path: Path) -> Iterator[None]:
+    """Convert errors of arrays that define no QP to an InputError that names a file."""
+    try:
+        yield
+    except (ValueError, TypeError, OverflowError, KeyError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
     except InputError as e:
         raise InputError(f"{path}: {e}") from None
@@ -198,16 +217,12 @@ def _meta(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     return json_object(str(array.item()))
 
 
-def _own_qp(
+def _serialised_qp(
     arrays: Mapping[str, NDArray[Any]],
     meta: Mapping[str, Any],
     operators: Mapping[str, Maker],
 ) -> QP:
-    """Return the QP of a file that `save_qp` has written; arrays are not copied."""
-    parts = [f"{name}_{part}" for name in _MATRICES for part in _PARTS]
-    if lacking := [name for name in (*_VECTORS, *parts) if name not in arrays]:
-        raise ValueError(f"{', '.join(lacking)} missing")
-    vectors: dict[str, Any] = {name: _vector(arrays, name) for name in _VECTORS}
+    """Return the QP of a file written with `serialised`; arrays are not copied."""
     matrices = {name: _matrix(arrays, name) for name in _MATRICES}
     for name in listed_dense(meta):
         # if all entries are stored, use a view of the values, which may be mapped
@@ -215,6 +230,7 @@ def _own_qp(
         rows, columns = M.shape
         full = M.nnz == rows * columns and M.has_canonical_format
         matrices[name] = M.data.reshape(columns, rows).T if full else M.toarray()
+    vectors: dict[str, Any] = {name: arrays[name] for name in VECTORS}
     if "maker" in meta:
         n, maker = vectors["q"].size, str(meta["maker"])
         matrices["P"] = SerialisableOperator(n, maker, _ingredients(arrays), operators)
@@ -225,26 +241,30 @@ def _own_qp(
     return QP(**vectors, **matrices, structure=structure, sets=further_sets(arrays))
 
 
-def _foreign_qp(arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> QP:
-    """Check the arrays of a file of unknown origin, and return their QP."""
-    if "maker" in meta:
-        raise ValueError(
-            "contains P as an operator, which is read only from files of the same run; "
-            "expected P as a matrix, as in files of export"
-        )
+def qp_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[QP, dict[str, Any]]:
+    """Check the arrays of a file of unknown origin, and return their QP and meta data.
+
+    Raises
+    ------
+    InputError, ValueError, TypeError, OverflowError
+        If the arrays define no valid QP.
+
+    """
+    meta = _meta(arrays)
     for name in arrays if "meta" not in arrays else ():
         if name not in _PLAIN and not SET_ARRAY.fullmatch(name):
-            raise unknown("array", name, (*_VECTORS, *_MATRICES))
-    parts: dict[str, Any] = {name: _foreign_matrix(arrays, name) for name in _MATRICES}
-    parts |= {name: _vector(arrays, name) for name in _VECTORS if name in arrays}
+            raise unknown("array", name, (*VECTORS, *_MATRICES))
+    parts: dict[str, Any] = {name: stored_matrix(arrays, name) for name in _MATRICES}
+    parts |= {name: _vector(arrays, name) for name in VECTORS if name in arrays}
     for name in listed_dense(meta):
         if issparse(parts[name]):
             check_dense(name, parts[name])
             parts[name] = parts[name].toarray()
-    return QP.from_arrays(**{"q": None, **parts}, sets=further_sets(arrays))
+    qp = QP.from_arrays(**{"q": None, **parts}, sets=further_sets(arrays))
+    return qp, meta
 
 
-def _foreign_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | None:
+def stored_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | None:
     """Return a matrix stored as an array or as CSC parts; None if it is missing."""
     if name in arrays:
         M = _vector(arrays, name)
@@ -295,7 +315,7 @@ def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
-    if arrays[name].dtype.kind not in "iuf":
+    if arrays[name].dtype.kind not in "biuf":
         raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
     # Values beyond the range of a double become inf, which callers reject.
     with np.errstate(over="ignore"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -139,46 +139,13 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
         `harness.files.datafile` allows, or lacks one of the `expected` arrays.
 
     """
-    return _expected(path, npz.read, expected)
-
-
-def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an npz file, mapped into memory if possible.
-
-    limited : apply the size limit also to files that can be mapped
-
-    Raises
-    ------
-    InputError
-        For the same reasons as in `read_arrays`.
-
-    """
-
-    def mapped(path: Path) -> dict[str, NDArray[Any]]:
-        try:
-            return npz.mapped(path, limited=limited)
-        except (
-            ValueError
-        ):  # the arrays are not aligned, since another program wrote the file
-            return npz.read(path)
-
-    return _expected(path, mapped, ())
-
-
-def _expected(
-    path: Path,
-    read: Callable[[Path], dict[str, NDArray[Any]]],
-    expected: tuple[str, ...],
-) -> dict[str, NDArray[Any]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            arrays = read(path)
+            arrays = npz.read(path)
     except InputError:
         raise
-    except (
-        Exception
-    ):  # zipfile raises many types of exceptions for texts, pickles and damaged files
+    except Exception:  # zipfile raises many types for texts, pickles and damaged files
         raise InputError(
             f"{path}: not an npz file of plain arrays; expected a file written by "
             "numpy.savez"

@@ -5,8 +5,7 @@ The process follows `harness.processes.protocol` and answers these requests:
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
   the point to ``out``. Optional entries are
 
-  - ``digest``: digest of the file, which is checked; without a digest, QPs with an
-    operator are refused,
+  - ``digest``: digest of the file, which is checked,
   - ``memory_limit``: limit in MiB,
   - ``once``: true for a single solve, which is timed, and
   - ``step``: index 0, 1, … of the QP in a sequence
@@ -217,8 +216,7 @@ class Worker:
                 if content_digest(path) != digest:
                     raise ValueError(f"{path.name} was changed on disk")
                 self._verified_files.add(version)
-        # A file without a digest may have any origin, so its operators are not built.
-        return load_qp(path, operators=None if digest is None else self.operators)[0]
+        return load_qp(path, operators=self.operators)[0]
 
     def _step(self, request: dict[str, Any]) -> Prepare | None:
         """Return the `prepare` function of a step; step 0 begins a new sequence.

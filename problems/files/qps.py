@@ -39,7 +39,7 @@ from scipy.sparse import coo_array, csc_array, tril, vstack
 
 from mortarbench.harness import QP, InputError, Vector
 from mortarbench.harness.errors import shortened, unknown
-from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.files.durable import writing
 from mortarbench.harness.files.qpfile import explicit_matrices
 from mortarbench.harness.qp import MIN_INFINITE
 from mortarbench.problems.files.two_sided import TwoSidedQP, real_number, sparse
@@ -367,12 +367,9 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
                 f"{path}: {name} contains {values[large.argmax()]:g}, but QPS treats "
                 f"{MIN_INFINITE:g} or more as infinite; expected .npz or .mat"
             )
-    try:
-        with replacing(path) as file:
-            for line in _lines(qp, meta):
-                file.write(f"{line}\n".encode())
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    with writing(path) as file:
+        for line in _lines(qp, meta):
+            file.write(f"{line}\n".encode())
 
 
 def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:

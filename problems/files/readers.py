@@ -9,14 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import eye_array
+from scipy.sparse import csc_array, eye_array
 
-from mortarbench.harness import QP, InputError
+from mortarbench.harness import QP, InputError, Vector
 from mortarbench.harness.checked import is_number, located
 from mortarbench.harness.files.datafile import content
-from mortarbench.harness.files.matfile import matrix, read_mat, to_qp, vector
+from mortarbench.harness.files.matfile import read_mat
 from mortarbench.harness.files.parquetfile import load_parquet
-from mortarbench.harness.files.qpfile import load_qp
+from mortarbench.harness.files.qpfile import (
+    check_dense,
+    load_qp,
+    malformed,
+    qp_of,
+    stored_matrix,
+)
 from mortarbench.harness.files.reading import read_json
 from mortarbench.problems.files.clarabel_json import clarabel_qp
 from mortarbench.problems.files.file_digest import format_of
@@ -56,10 +62,11 @@ def _npz(path: Path) -> LoadedQP:
 def _mat(path: Path) -> LoadedQP:
     """Read a .mat file: an export (it contains G or h) or a Maros-Mészáros problem."""
     arrays = read_mat(path)
-    with located(str(path)):
-        if not {"G", "h"} & arrays.keys():
+    with malformed(path):
+        if not {"G_data", "G", "h"} & arrays.keys():
             return loaded(maros_meszaros(arrays))
-        exported = to_qp(arrays)
+        # a file may contain further variables of a session
+        exported = qp_of({"meta": np.array("{}"), **arrays})
     return _with_units(path, exported)
 
 
@@ -139,7 +146,25 @@ def _first_named(
     arrays: Mapping[str, Any], read: Callable[..., Any], *names: str
 ) -> Any:
     """Read the variable with the first of `names` that is present."""
-    return read(arrays, next((name for name in names if name in arrays), names[0]))
+    there = (n for n in names if n in arrays or f"{n}_data" in arrays)
+    return read(arrays, next(there, names[0]))
+
+
+def matrix(arrays: Mapping[str, Any], name: str) -> Any:
+    """Return a variable as a sparse matrix; raise InputError if it is none."""
+    M = stored_matrix(arrays, name)
+    if M is None:
+        raise InputError(f"{name} is missing; expected a matrix of numbers")
+    return csc_array(M, dtype=float)
+
+
+def vector(arrays: Mapping[str, Any], name: str) -> Vector:
+    """Return a variable that is a row or column as a vector (n,)."""
+    M = matrix(arrays, name)
+    check_dense(name, M)
+    if M.size and 1 not in M.shape:
+        raise InputError(f"{name} is of shape {M.shape}; expected one row or column")
+    return np.asarray(M.toarray().ravel())
 
 
 def _with_units(path: Path, exported: tuple[QP, Mapping[str, Any]]) -> LoadedQP:

@@ -118,7 +118,7 @@ def test_mat_and_parquet_with_broken_sets_are_refused(tmp_path):
         (
             "disc_index",
             None,
-            "qp.parquet: Discs: index = .*None.*; expected an array",
+            "qp.parquet: disc_index is missing, but disc_radius is present",
         ),
         ("cone_slope", ["steep"], "qp.parquet: cone_slope is not a list of numbers"),
     ):

@@ -66,7 +66,7 @@ def ask(tmp_path):
     """Return a function that starts a worker and requests a solve of the tiny QP."""
     tiny = load_plugin(PLUGIN).problems["tiny"]
     qp = tmp_path / "qp.npz"
-    save_qp(qp, tiny.build("plain", None).qp, {})
+    save_qp(qp, tiny.build("plain", None).qp, serialised=True)
     request = {"qp": str(qp), "tol": 1e-6, "out": str(tmp_path / "point.npz")}
     workers = {}
 
@@ -177,7 +177,7 @@ def test_a_worker_that_cannot_start_states_the_reason(ask):
 
 def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
     tiny = load_plugin(PLUGIN).problems["tiny"]
-    save_qp(tmp_path / "qp.npz", tiny.build("plain", None).qp, {})
+    save_qp(tmp_path / "qp.npz", tiny.build("plain", None).qp, serialised=True)
     request = {"qp": str(tmp_path / "qp.npz"), "tol": 1e-6, "out": "unused"}
     arguments = [command("hangs"), request, str(tmp_path / "log")]
     parent = os.spawnv(

@@ -106,10 +106,10 @@ def test_no_command_runs_code_named_by_a_case_of_the_folder(sent, command, tmp_p
     assert command("report", folder, "--format", "md")[0] == 0
     code, out, err = command("validate", folder)
     assert code in (0, 1, 2), err
-    assert "P as an operator" in out + err
+    assert "not an npz file" in out + err
     code, out, err = command("replay", folder, "b2")
     assert (code, out) == (2, "")
-    assert "P as an operator" in err
+    assert "not an npz file" in err
 
     assert not (tmp_path / "SENTINEL").exists()
 

@@ -477,12 +477,12 @@ def test_on_any_full_disk_a_run_ends_in_one_line_and_can_continue(
     assert writes > 6  # suite and environment need four writes
 
 
-@pytest.mark.parametrize("size", [600, 4000])
+@pytest.mark.parametrize("size", [600, 1500])
 def test_a_full_disk_in_the_case_worker_or_worker_yields_no_verdict(
     measure, tmp_path, size
 ):
     """A file of a point is larger than 600 bytes, and a file of a case is larger than
-    4000 bytes.
+    1500 bytes.
     """
     whole = suite("honest", "prints")
     if size == 600:

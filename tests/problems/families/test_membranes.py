@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 from scipy.linalg import block_diag
 from scipy.sparse import issparse
 
 from mortarbench.harness import InputError, Solution, Status
-from mortarbench.harness.files.matfile import read_mat, save_mat
+from mortarbench.harness.files.matfile import save_mat
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.feti_models import Membranes, hat_integrals
@@ -136,7 +137,7 @@ def test_the_mat_file_contains_the_dual_in_the_notation_of_the_paper(tmp_path):
     save_mat(tmp_path / "m.mat", case.qp, {}, case.matrices)
     M = {
         name: M.toarray() if issparse(M) else M
-        for name, M in read_mat(tmp_path / "m.mat").items()
+        for name, M in loadmat(tmp_path / "m.mat").items()
         if name != "meta"
     }
     K = block_diag(*[grid_stiffness((2, 2)).toarray()] * 8)

@@ -508,19 +508,19 @@ def test_limits_near_1e20_are_infinite(written):
         ({"P": csc_matrix(np.eye(3))}, "P has shape (3, 3), expected (4, 4)"),
         ({"l": np.full(5, 2.0), "u": np.ones(5)}, "the limits of row 0 (from 0) cross"),
         ({"l": np.full(5, 1e21), "u": np.full(5, 1e21)}, "the limits of row 0"),
-        ({"q": np.full(4, np.nan)}, "q contains NaN"),
+        ({"q": np.full(4, np.nan)}, "q[0] is nan; expected a finite number"),
         ({"q": np.full(4, np.inf)}, "q[0] is inf; expected a finite number"),
         ({"lb": np.zeros(3)}, "lb has shape (3,), expected (4,)"),
         (
             {"lb": np.full(4, 3), "ub": np.full(4, 2)},
             "the limits of variable 0 (from 0) cross: 3 > 2",
         ),
-        ({"q": "text"}, "q is not a matrix of numbers"),
+        ({"q": "text"}, "q is of type <U4; expected numbers"),
         ({"q": np.eye(4)}, "q is of shape (4, 4); expected one row or column"),
         ({"m": 7}, "m contradicts the other variables; expected 5"),
         ({"u": np.ones(4)}, "u has shape (4,), expected (5,)"),
         ({"A": None}, "A is missing"),
-        ({"G": np.eye(4)}, "h is missing"),
+        ({"G": np.eye(4)}, "h is missing, but G is present"),
     ],
 )
 def test_an_invalid_mat_file_is_named_with_the_error(written, changes, message):
