@@ -24,9 +24,7 @@ reach the same points and multipliers.
 P is dense (one triangle is read), sparse, a compiled linear map, or an operator called
 through Python. A sparse P with few nonzero diagonals, such as a difference or finite
 element matrix on a grid, is stored by diagonals. Products then process neighbouring
-rows at the same time, and read only half of the entries because P is symmetric. A CG
-step then passes over memory twice: once for the direction, its product and the step
-lengths, and once for the step and the new gradient. The free gradient is not stored.
+rows at the same time, and read only half of the entries because P is symmetric.
 The loops over vectors are in `vectors.h`.
 """
 
@@ -34,7 +32,7 @@ cimport cython
 cimport numpy as cnp
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport (
-    INFINITY, fabs, fmax, fmin, frexp, isfinite, isinf, ldexp, rint, sqrt
+    INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 )
 from libc.stdlib cimport calloc, free as release_memory, realloc
 from libc.string cimport memcpy, memset
@@ -71,17 +69,8 @@ cdef extern from "vectors.h" nogil:
                               signed char *slot)
     void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
     void sparse_product(const sparse *F, double s, const double *v, double *y)
-    void sparse_lengths(const sparse *F, double s, const double *x, const double *g,
-                        double *p, double *Hp, const double *lower,
-                        const double *upper, double *result)
-    void sparse_update_direction(const sparse *F, double s, double gamma, const double *x,
-                     const double *g, double *p, double *Hp, const double *lower,
-                     const double *upper, double *result)
     double update_free_direction(const double *g, const double *free, double gamma, double *p,
                        Py_ssize_t n)
-    void sparse_update_free_direction(const sparse *F, double s, const double *g,
-                            const double *free, double gamma, double *p, double *Hp,
-                            double *result)
     double dot(const double *a, const double *b, Py_ssize_t n)
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
@@ -95,9 +84,6 @@ cdef extern from "vectors.h" nogil:
                      double *y, Py_ssize_t k, Py_ssize_t n)
     void add_combination(double s, const double *U, const double *c, double *y,
                          Py_ssize_t k, Py_ssize_t n)
-    double next_direction(double gamma, const double *x, const double *g,
-                          const double *lower, const double *upper, double *p,
-                          Py_ssize_t n, double *result)
     double first_bound(const double *x, const double *p, const double *lower,
                        const double *upper, Py_ssize_t n)
     void lengths(const double *x, const double *g, const double *p, const double *Hp,
@@ -196,9 +182,6 @@ cdef extern from "discs.h" nogil:
         const Py_ssize_t *range
     void project_discs(const discs *D, double *y)
     double first_disc(const discs *D, const double *x, const double *p, double least)
-    double next_on_discs(const discs *D, double gamma, const double *x,
-                         const double *g, double *p, double least, double *result)
-    bint leaves_discs(const discs *D, const double *x, const double *g, double length)
     void split_discs(const discs *D, const double *x, const double *g, double tau,
                      double *phi, double *free, double *result)
     void advance_discs(const discs *D, double alpha, double *x, double *g,

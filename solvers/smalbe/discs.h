@@ -162,50 +162,6 @@ static double first_disc(const discs *D, const double *x, const double *p, doubl
     return WITH_DIMENSION(D, first_of_each, x, p, least);
 }
 
-INLINE double next_on_each(const discs *D, int d, double gamma, const double *x,
-                           const double *g, double *p, double least, double *result)
-{
-    double slope = 0, size = 0;
-    for (Py_ssize_t i = 0; i < D->count; i++) {
-        double square = square_of_disc(D, d, i, x);
-        int inside = is_inside(D, i, square);
-        FOR_VARIABLES(D, i, d, j) {
-            double to = (inside ? g[j] : 0) - gamma * p[j];
-            slope += g[j] * to;
-            size += to * to;
-            p[j] = to;
-        }
-        least = first_of_disc(D, d, i, x, p, square, least);
-    }
-    result[0] += slope;
-    result[1] += size;
-    return least;
-}
-
-/* p = φ − γp on discs; add gᵀp and ‖p‖² to result. Return the smallest α at which
-   x − αp leaves a disc, at most `least`. */
-static double next_on_discs(const discs *D, double gamma, const double *x,
-                            const double *g, double *p, double least, double *result)
-{
-    return WITH_DIMENSION(D, next_on_each, gamma, x, g, p, least, result);
-}
-
-INLINE int leaves_each(const discs *D, int d, const double *x, const double *g,
-                       double length)
-{
-    for (Py_ssize_t i = 0; i < D->count; i++)
-        if (projected_factor(D, d, i, x, g, length) < 1
-            && is_inside(D, i, square_of_disc(D, d, i, x)))
-            return 1;
-    return 0;
-}
-
-/* Return 1 if x − φ·length is outside any disc, else 0. */
-static int leaves_discs(const discs *D, const double *x, const double *g, double length)
-{
-    return WITH_DIMENSION(D, leaves_each, x, g, length);
-}
-
 INLINE void split_each(const discs *D, int d, const double *x, const double *g,
                        double tau, double *phi, double *free, double *result)
 {

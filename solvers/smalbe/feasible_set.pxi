@@ -126,61 +126,6 @@ cdef class FeasibleSet:
                                             self.upper + o, size))
         return first_disc(&self.D, x, p, least)
 
-    cdef double next_direction(
-        self, double gamma, const double *x, const double *g, double *p, double *result
-    ) noexcept:
-        """p ← φ − γp, in one pass; result ← gᵀp and ‖p‖².
-
-        Returns the largest α for which x − αp is in the set. Only for sets with discs.
-        """
-        cdef double least = INFINITY
-        cdef double sums[2]
-        cdef Py_ssize_t i, o, size
-        result[0] = result[1] = 0.0
-        for i in range(self.D.ranges):
-            o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
-            least = fmin(least, next_direction(
-                gamma, x + o, g + o, self.lower + o, self.upper + o, p + o, size, sums
-            ))
-            result[0] += sums[0]
-            result[1] += sums[1]
-        return next_on_discs(&self.D, gamma, x, g, p, least, result)
-
-    cdef bint leaves(self, const double *x, const double *g, double length) noexcept:
-        """Return True if x − φ·length is outside the set.
-
-        Only for sets with discs.
-        """
-        cdef Py_ssize_t i, j
-        cdef double to
-        for i in range(self.D.ranges):
-            for j in range(self.D.range[2 * i], self.D.range[2 * i + 1]):
-                to = x[j] - length * g[j]
-                if self.lower[j] < x[j] < self.upper[j] and not (
-                    self.lower[j] <= to <= self.upper[j]
-                ):
-                    return True
-        return leaves_discs(&self.D, x, g, length)
-
-    cdef void product_and_lengths(
-        self, const sparse *F, double s, const double *x, const double *g, double *p,
-        double *Hp, Line *line
-    ) noexcept:
-        """Hp ← s F p, and the `lengths` along p, in one pass over memory."""
-        sparse_lengths(F, s, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
-        if self.D.count:
-            line.feasible = fmin(line.feasible, first_disc(&self.D, x, p, line.feasible))
-
-    cdef void next_product_and_lengths(
-        self, const sparse *F, double s, double gamma, const double *x, const double *g,
-        double *p, double *Hp, Line *line
-    ) noexcept:
-        """p ← φ − γp, Hp ← s F p, and the `lengths` along p, in one pass over memory.
-
-        The set must not contain discs.
-        """
-        sparse_update_direction(F, s, gamma, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
-
     cdef void split(self, const double *x, const double *g, double tau, double *phi,
                     double *free, Parts *parts) noexcept:
         """Compute φ and `free` (1 off the boundary, else 0) for the face of x."""

@@ -58,29 +58,10 @@ cdef enum:
     # products with 1468, 41 684 and 166 740 discs. With 100 steps in all three cases,
     # an earlier version took 61, 217 and 444 products, and five times the memory.
     FIRST_NEWTON = 100
-    # Number of bits of the length of a spectral step. A small change of a length leads
-    # to another sequence of spectral steps. If lengths are rounded, sums in another
-    # order (on another number of processes) yield the same lengths, unless a length is
-    # within rounding of the middle between two numbers with this number of bits.
-    LENGTH_BITS = 8
 
 
 # Fraction of the linear decrease that a spectral step must achieve (Armijo condition).
 cdef double SUFFICIENT_DECREASE = 1e-4
-
-
-# If the step to the boundary is longer than this fraction of the CG step, the expansion
-# consists of this step alone. Without this constant and SPECTRAL_GAMMA, Mindlin's
-# problem with 1468 discs, ν = 0.3, takes 100 instead of 71 products.
-cdef double LONG_STEP = 0.5
-
-
-# Two components or discs count as reaching the boundary at the same time if their step
-# lengths differ by at most this fraction. A step to the boundary is longer by this
-# fraction, so that both reach the boundary. In symmetric problems, such as greco/dim=3,
-# the lengths of mirror images differ by rounding (3e-14), which determines which of
-# the two lengths is shorter.
-cdef double TIE = 2.0 ** -42
 
 
 # Relative accuracy of conjugate gradients in a Newton step. With 0.1, the contact
@@ -96,13 +77,6 @@ cdef double MIN_PROJECTING = 1e4
 
 # Factor of Γ² for spectral steps, which act on φ and β at the same time
 cdef double SPECTRAL_GAMMA = 0.1
-
-cdef double rounded(double length) noexcept:
-    """Return a positive length rounded to LENGTH_BITS bits."""
-    cdef int exponent
-    cdef double fraction = frexp(length, &exponent)
-    return ldexp(rint(ldexp(fraction, LENGTH_BITS)), exponent - LENGTH_BITS)
-
 
 cdef double change_along(const Line *line, double alpha) noexcept:
     """Return f(x − αp) − f(x)."""
@@ -244,9 +218,6 @@ cdef class MPRGP:
     cdef double inverse_norm, rho
     cdef double alpha, Gamma_square
     cdef int expansion
-    # CG passes over memory twice, and on sets with discs once more for an F that is not
-    # sparse; φ and `free` are not stored
-    cdef bint in_two
     cdef Room room  # memory of all vectors
     cdef double *rhs  # b of the inner problem
     cdef double *x
@@ -294,7 +265,6 @@ cdef class MPRGP:
     cdef long settled  # number of steps on an unchanged face since that check
     cdef long patience  # number of steps before the next Newton step
     cdef double spectral_length  # α of the last step; 0 before the first one
-    cdef double p_square  # ‖p‖² on sets with discs, if `in_two`
     cdef double cost_now  # cost relative to the cost at the start of the run
     cdef double costs[MEMORY]  # last values of `cost_now`
     cdef long n_costs
@@ -337,11 +307,7 @@ cdef class MPRGP:
         cdef int letter
         cdef bint has_expanded = False, begun = True
         cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
-        cdef double began, gamma = 0.0  # γ of the deferred update p ← φ − γp
-        self.in_two = not self.rows.exist and not self.is_preconditioned() and (
-            self.set.has_discs
-            or (self.F.rows.data != NULL and self.expansion != SPECTRAL)
-        )
+        cdef double began
         self.cost_now, self.n_costs = 0.0, 0
         self.settled = 0
         self.record_cost(0.0)
@@ -385,18 +351,15 @@ cdef class MPRGP:
             else:
                 # 4. The trial step of conjugate gradients, with α_cg and the largest
                 # feasible length α_f.
-                if self.in_two:
-                    self.lengths_of_next(gamma)
-                else:
-                    self.lengths_along(self.p, self.Hp)
+                self.lengths_along(self.p, self.Hp)
                 if isinf(fmin(self.line.cg, self.line.feasible)) or self.is_spent():
                     if not self.is_semidefinite or not self.refresh():
                         return 0
-                    inside, gamma = 0, 0.0
+                    inside = 0
                     continue
                 if self.line.cg <= self.line.feasible:
                     # 5. Conjugate gradient step, and the next direction.
-                    gamma = self.minimise_along_p()
+                    self.minimise_along_p()
                     self.record_step(b"c", trace, note)
                     inside += 1
                     continue
@@ -411,7 +374,7 @@ cdef class MPRGP:
                 return 0
             # 7. Restart CG on the new face with the preconditioned free gradient. After
             # a spectral step, restart only if CG begins on this face.
-            inside, began, gamma = 0, self.parts.phi_square, 0.0
+            inside, began = 0, self.parts.phi_square
             self.phi_square_at_drift = self.phi_square_at_refresh = INFINITY
             begun = self.expansion != SPECTRAL
             if begun:
@@ -481,10 +444,6 @@ cdef class MPRGP:
     cdef int first_direction(self) except -1:
         """Prepare the preconditioner for the face and set p to z."""
         self.least_slope = INFINITY
-        if self.in_two:
-            # φ is added later, in the pass that computes the product
-            memset(self.p, 0, self.n * sizeof(double))
-            return 0
         if self.factor is not None:
             self.factor.enter(self.free, True)
         elif self.is_preconditioned():
@@ -608,16 +567,11 @@ cdef class MPRGP:
         begun : false if CG does not yet have a first direction on this face
         """
         cdef bint is_tested = self.expansion == SPECTRAL and self.spectral_length > 0
-        if self.in_two and is_tested and (
-            self.set.leaves(self.x, self.g, self.spectral_length)  # p will be φ
-        ):
-            return True
         if not begun:
-            if not self.in_two:
-                self.split()
-                self.directions.begin(self.free)
+            self.split()
+            self.directions.begin(self.free)
             self.first_direction()
-        return not self.in_two and is_tested and (
+        return is_tested and (
             self.set.feasible_length(self.x, self.p) < self.spectral_length
         )
 
@@ -728,7 +682,7 @@ cdef class MPRGP:
         # components of g may violate this inequality, and the step would be rejected.
         line.slope = fmax(line.slope, tau * square)
         if line.curvature > NOISE * line.slope:
-            self.spectral_length = rounded(square / line.curvature)
+            self.spectral_length = square / line.curvature
         if change_along(line, 1.0) > rise - SUFFICIENT_DECREASE * line.slope:
             return line.slope / line.curvature
         return 1.0
@@ -758,43 +712,13 @@ cdef class MPRGP:
 
     cdef int lengths_along(self, double *p, double *Hp) except -1:
         """Hp ← H p, and `line` ← the `lengths` of x − αp; one product."""
-        if self.rows.exist or not self.F.rows.data:
-            self.H(p, Hp)
-            self.set.lengths(self.x, self.g, p, Hp, &self.line)
-            return 0
-        self.F.count += 1
-        self.set.product_and_lengths(
-            &self.F.rows, self.inverse_norm, self.x, self.g, p, Hp, &self.line
-        )
+        self.H(p, Hp)
+        self.set.lengths(self.x, self.g, p, Hp, &self.line)
         return 0
-
-    cdef int lengths_of_next(self, double gamma) except -1:
-        """p ← φ − γp, then `lengths_along` p; one product."""
-        cdef Line *line = &self.line
-        cdef double sums[3]
-        if self.set.has_discs:
-            line.feasible = self.set.next_direction(
-                gamma, self.x, self.g, self.p, sums
-            )
-            self.H(self.p, self.Hp)
-            sums[2] = dot(self.p, self.Hp, self.n)
-            line.slope, self.p_square, line.curvature = sums[0], sums[1], sums[2]
-            line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
-            return 0
-        self.F.count += 1
-        self.set.next_product_and_lengths(
-            &self.F.rows, self.inverse_norm, gamma, self.x, self.g, self.p, self.Hp,
-            &self.line,
-        )
-        return 0
-
-    cdef double square_of_p(self) noexcept:
-        """Return ‖p‖² of the direction of a spectral method."""
-        return self.p_square if self.in_two else dot(self.p, self.p, self.n)
 
     # 5. The conjugate gradient step
 
-    cdef double minimise_along_p(self) except? -1:
+    cdef int minimise_along_p(self) except -1:
         """Take the CG step along `line` and compute the next direction.
 
         If rounding has reintroduced components of the gradient along earlier
@@ -803,7 +727,6 @@ cdef class MPRGP:
         last one, because it would otherwise be repeated endlessly when only rounding
         errors remain.
 
-        The result is γ of a deferred update p ← φ − γp, or 0 if p is up to date.
         """
         cdef double length = self.line.cg, curvature = self.line.curvature, z_Hp
         cdef const double *z
@@ -814,10 +737,10 @@ cdef class MPRGP:
         )
         self.record_cost(change_along(&self.line, length))
         if self.expansion == SPECTRAL:
-            self.spectral_length = rounded(self.square_of_p() / curvature)
+            self.spectral_length = dot(self.p, self.p, self.n) / curvature
         if drifts and self.line.slope <= 0:
             length = 0.0
-        elif not self.in_two:
+        else:
             self.directions.add(self.p, self.Hp, curvature)
         self.to(length, self.p, self.Hp)
         if drifts:
@@ -830,8 +753,6 @@ cdef class MPRGP:
         add(-length, self.Cv, self.Cx, self.rows.r)
         self.knows_Cx = knows_Cx
         z_Hp = self.parts.phi_Hp
-        if self.in_two:
-            return z_Hp / curvature
         z = self.preconditioned_gradient()
         if self.directions.count:  # p is one of the stored directions
             memcpy(self.p, z, self.n * sizeof(double))
@@ -849,7 +770,6 @@ cdef class MPRGP:
 
         stored : false if φ and `free` are not needed
         """
-        stored = stored and not self.in_two
         self.set.advance(alpha, self.x, self.g, p, Hp, self.B.tau,
                          self.phi if stored else NULL, self.free if stored else NULL,
                          &self.parts)
@@ -889,13 +809,14 @@ cdef class MPRGP:
         return b"f"
 
     cdef int expand_spectrally(self) except -1:
-        """Step to the boundary; add a spectral step unless the step is long enough."""
-        cdef double feasible = (1 + TIE) * self.line.feasible, cg = self.line.cg
+        """Step to the boundary, and store the length of the next spectral step."""
         if self.line.curvature > NOISE * self.line.slope:
-            self.spectral_length = rounded(self.square_of_p() / self.line.curvature)
-        self.record_cost(change_along(&self.line, feasible))
-        self.to(feasible, self.p, self.Hp, False)
-        return feasible > LONG_STEP * cg or self.step_spectrally()
+            self.spectral_length = (
+                dot(self.p, self.p, self.n) / self.line.curvature
+            )
+        self.record_cost(change_along(&self.line, self.line.feasible))
+        self.to(self.line.feasible, self.p, self.Hp, False)
+        return 1
 
     cdef int trial_of_rule(self, double *y) except -1:
         """y ← Π(x_trial − x̃) with the trial point x_trial of a subclass's step rule.
@@ -1027,14 +948,9 @@ cdef class MPRGP:
             self.sums[0] = dot(self.phi, self.p, self.n)
             self.sums[1] = dot(self.p, self.Hp, self.n)
             return 0
-        if self.rows.exist or not self.F.rows.data:
-            self.sums[0] = update_free_direction(self.g2, self.free, gamma, self.p, self.n)
-            self.H(self.p, self.Hp)
-            self.sums[1] = dot(self.p, self.Hp, self.n)
-            return 0
-        self.F.count += 1
-        sparse_update_free_direction(&self.F.rows, self.inverse_norm, self.g2, self.free, gamma,
-                           self.p, self.Hp, self.sums)
+        self.sums[0] = update_free_direction(self.g2, self.free, gamma, self.p, self.n)
+        self.H(self.p, self.Hp)
+        self.sums[1] = dot(self.p, self.Hp, self.n)
         return 0
 
     cdef int project_gradient(self, double tau) except -1:

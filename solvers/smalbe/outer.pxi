@@ -217,7 +217,7 @@ cdef class SMALBE(MPRGP):
         is_free = np.asarray(free, dtype=float)
         memcpy(self.free, address(is_free), n * sizeof(double))
         masked(self.free, read(v, owners), self.phi, n)
-        self.rho, self.in_two = rho, False
+        self.rho = rho
         self.choose_models()
         self.first_direction()
         return copied(self.p, n)

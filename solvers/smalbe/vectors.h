@@ -135,15 +135,8 @@ TWICE static void sparse_product(const sparse *F, double s, in v, out y)
         some_rows(F, i, i + BLOCK < F->n ? i + BLOCK : F->n, s, v, y + i);
 }
 
-/* Return the half bandwidth, which is the largest |i − j| with F[i, j] ≠ 0; n if F
-   is stored by rows. */
-INLINE Py_ssize_t reach(const sparse *F)
-{
-    return F->count ? F->offset[F->count - 1] : F->n;
-}
-
 /* p = φ − γp, where φ = g for free components and zero for others; return φᵀp. */
-INLINE double direction_block(in g, in free, double gamma, out p, Py_ssize_t n)
+TWICE static double update_free_direction(in g, in free, double gamma, out p, Py_ssize_t n)
 {
     double slope = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -152,28 +145,6 @@ INLINE double direction_block(in g, in free, double gamma, out p, Py_ssize_t n)
         slope += f * p[i];
     }
     return slope;
-}
-
-TWICE static double update_free_direction(in g, in free, double gamma, out p, Py_ssize_t n)
-{
-    return direction_block(g, free, gamma, p, n);
-}
-
-/* `update_free_direction`, then Hp = s F p, in one pass over memory; result = φᵀp, pᵀHp. */
-TWICE static void sparse_update_free_direction(const sparse *F, double s, in g, in free,
-                                     double gamma, out p, out Hp, out result)
-{
-    Py_ssize_t n = F->n, updated = 0;
-    result[0] = result[1] = 0;
-    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
-        Py_ssize_t last = i + BLOCK < n ? i + BLOCK : n;
-        Py_ssize_t to = last + reach(F) < n ? last + reach(F) : n;
-        result[0] += direction_block(g + updated, free + updated, gamma, p + updated, to - updated);
-        updated = to;
-        some_rows(F, i, last, s, p, Hp + i);
-        for (Py_ssize_t j = i; j < last; j++)
-            result[1] += p[j] * Hp[j];
-    }
 }
 
 /* Write the offsets of the nonzero diagonals of F and return their number, or 0 if
@@ -456,50 +427,6 @@ INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssiz
     return least;
 }
 
-/* p = φ − γp with the free gradient φ at x. */
-INLINE void
-update_direction_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssize_t n)
-{
-    four length = EACH(gamma);
-    Py_ssize_t i = 0;
-    for (; i + 4 <= n; i += 4) {
-        mask inside = FOUR(x + i) > FOUR(lower + i);
-        if (upper)
-            inside &= FOUR(x + i) < FOUR(upper + i);
-        *(four *) (p + i) = (four) ((mask) FOUR(g + i) & inside) - length * FOUR(p + i);
-    }
-    for (; i < n; i++) {
-        int inside = (x[i] > lower[i]) & (upper ? x[i] < upper[i] : 1);
-        p[i] = (inside ? g[i] : 0) - gamma * p[i];
-    }
-}
-
-/* result = α_cg, α_f, gᵀp, pᵀHp of the line x - αp. Hp = s F p is computed block by
-   block in the same pass over memory. If `is_update`, the components of p = φ − γp
-   that the product of a block reads are computed just before this product. */
-INLINE void find_lengths(const sparse *F, double s, int is_update, double gamma, in x,
-                         in g, double *p, out Hp, in lower, in upper, Py_ssize_t n,
-                         out result)
-{
-    double feasible = INFINITY;
-    Py_ssize_t updated = 0;
-    result[2] = result[3] = 0;
-    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
-        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
-        if (is_update) {
-            Py_ssize_t to = i + size + reach(F) < n ? i + size + reach(F) : n;
-            update_direction_at(x + updated, g + updated, lower + updated, upper ? upper + updated : NULL,
-                    gamma, p + updated, to - updated);
-            updated = to;
-        }
-        some_rows(F, i, i + size, s, p, Hp + i);
-        feasible = lengths_block(x + i, g + i, p + i, Hp + i, lower + i,
-                                 upper ? upper + i : NULL, size, feasible, result);
-    }
-    result[0] = result[3] > 0 ? result[2] / result[3] : INFINITY;
-    result[1] = feasible;
-}
-
 INLINE double first_of_blocks(in x, in p, in lower, in upper, double least, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i += BLOCK) {
@@ -538,41 +465,6 @@ TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_
     result[1] = feasible < result[0] ? feasible : INFINITY;
     result[2] = slope;
     result[3] = curvature;
-}
-
-TWICE static void sparse_lengths(const sparse *F, double s, in x, in g, double *p,
-                                 out Hp, in lower, in upper, out result)
-{
-    if (upper)
-        find_lengths(F, s, 0, 0, x, g, p, Hp, lower, upper, F->n, result);
-    else
-        find_lengths(F, s, 0, 0, x, g, p, Hp, lower, NULL, F->n, result);
-}
-
-/* p = φ − γp with the free gradient φ at x, and the `sparse_lengths` along p. */
-TWICE static void sparse_update_direction(const sparse *F, double s, double gamma, in x, in g,
-                              double *p, out Hp, in lower, in upper, out result)
-{
-    if (upper)
-        find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, upper, F->n, result);
-    else
-        find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, NULL, F->n, result);
-}
-
-/* p = φ − γp with the free gradient φ at x; result = gᵀp, ‖p‖². Return the α at which
-   x - αp reaches its first bound; inf if it reaches none. */
-TWICE static double next_direction(double gamma, in x, in g, in lower, in upper, out p,
-                                   Py_ssize_t n, out result)
-{
-    double slope = 0, size = 0;
-    update_direction_at(x, g, lower, upper, gamma, p, n);
-    for (Py_ssize_t i = 0; i < n; i++) {
-        slope += g[i] * p[i];
-        size += p[i] * p[i];
-    }
-    result[0] = slope;
-    result[1] = size;
-    return first_of_blocks(x, p, lower, upper, INFINITY, n);
 }
 
 /* Return x - step, or a bound if x - step is within rounding of this bound. */
