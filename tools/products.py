@@ -4,9 +4,8 @@
 
 A table is measured if the heading of its first column is ``case``. A cell of this
 column begins with a case name in backquotes, in which ``key=1..24`` denotes a sequence
-of cases. With several keys of this type, the last key varies fastest. The heading of a
-measured column begins with a solver in backquotes (possibly with options ``key=value``)
-or with ``best preset``, followed by the tolerance. If the solver reuses earlier results
+of cases. The heading of a measured column begins with a solver in backquotes or with
+``best preset``, followed by the tolerance. If the solver reuses earlier results
 in a sequence, ``warm`` follows. Other columns are left unchanged.
 """
 
@@ -15,7 +14,6 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
@@ -74,36 +72,32 @@ def products(case: str, head: str) -> int:
     """
     match = HEAD.fullmatch(head)
     assert match is not None
-    solver, tol, mode = match[1], float(match[2]), match[3] or ""
-    if solver:
-        return _spent(case, solver, tol, mode)
-    return min(_spent(case, preset, tol, mode) for preset in PRESETS)
+    tol, warm = float(match[2]), match[3] is not None
+    names = [match[1]] if match[1] else PRESETS
+    return min(_products(case, name, tol, warm) for name in names)
 
 
-def _spent(sequence: str, text: str, tol: float, mode: str) -> int:
-    name, *pairs = text.split()
-    options = dict(pair.split("=", 1) for pair in pairs)
-    flags = {"true": True, "false": False}
-    solver = replace(SOLVERS[name], **{k: flags.get(v, v) for k, v in options.items()})
-    chain = solver.chain(tol) if mode else None
-    spent = 0
+def _products(sequence: str, name: str, tol: float, warm: bool) -> int:
+    solver, spent = SOLVERS[name], 0
+    chain = solver.chain(tol) if warm else None
     for case in _cases(sequence):
         solve = chain(case.qp) if chain else solver.prepare(case.qp, tol)
         answer: Solution = solve()
         if not kkt_residuals(case.qp, answer).worst <= VERIFIED_FACTOR * tol:
-            raise ValueError(f"{sequence}: {text} is not verified at {tol:g}")
+            raise ValueError(f"{sequence}: {name} is not verified at {tol:g}")
         spent += answer.counts["P_products"]
     return spent
 
 
 @cache
 def _cases(sequence: str) -> tuple[Case, ...]:
-    names = [sequence]
-    while span := SEQUENCE.search(names[0]):
-        values = range(int(span[2]), int(span[3]) + 1)
-        names = [
-            SEQUENCE.sub(rf"\g<1>={k}", name, count=1) for name in names for k in values
-        ]
+    span = SEQUENCE.search(sequence)
+    if span is None:
+        return (build(sequence).family_case,)
+    key, first, last = span.groups()
+    names = (
+        SEQUENCE.sub(f"{key}={k}", sequence) for k in range(int(first), int(last) + 1)
+    )
     return tuple(build(name).family_case for name in names)
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import sys
+import tomllib
 
 import pytest
 
@@ -12,62 +13,38 @@ import mutants
 
 
 def changes(code):
-    found = mutants.mutants_of("m.py", code.encode())
+    found = mutants.mutants_of(code.encode())
     for m in found:
         ast.parse(m.source)
-    return {m.change for m in found}
+    return {m.change.partition(": ")[2] for m in found}
 
 
 @pytest.mark.parametrize(
     ("code", "expected"),
     [
-        ("y = a + b", {"a + b -> (a - b)"}),
-        ("y = -x", {"-x -> (x)"}),
-        ("y = x < z", {"x < z -> (x > z)"}),
-        ("y = x < 1", {"x < 1 -> (x > 1)", "x < 1 -> (x <= 1)", "1 -> (2)"}),
-        ("y = a or b", {"a or b -> (a and b)", "a or b -> (a)", "a or b -> (b)"}),
+        ("y = a + b", {"a + b -> a - b"}),
+        ("y = -x", {"-x -> x"}),
+        ("y = x < 1", {"x < 1 -> x >= 1", "1 -> 2"}),
+        ("y = a or b", {"a or b -> a and b"}),
         ("y = np.abs(gap).max()", {
-            "np.abs(gap).max() -> (np.abs(gap).min())", "np.abs(gap) -> (gap)",
+            "np.abs(gap).max -> np.abs(gap).min", "np.abs(gap) -> gap",
         }),
-        ("y = 2.5", {"2.5 -> (5.0)"}),
+        ("y = 2.5 * 0", {"2.5 * 0 -> 2.5 / 0", "2.5 -> 5.0", "0 -> 1"}),
         ("left.reverse()", {"left.reverse() -> pass"}),
-        ("def f():\n    if bad:\n        return\n    go(λ)", {
-            "return -> pass", "go(λ) -> pass",
+        ("def f():\n    if not bad:\n        go(λ)", {
+            "not bad -> bad", "go(λ) -> pass",
         }),
+        # texts, types and messages are not changed
+        ("@cache(3)\ndef f(a: int | str) -> Literal[4]: return f'{a + 5}'", set()),
     ],
 )  # fmt: skip
 def test_each_mutant_has_one_change(code, expected):
     assert changes(code) == expected
 
 
-def test_texts_types_and_messages_are_not_mutated():
-    code = """
-"A docstring."
-x: Literal[1, 2]
-@cache(3)
-def f(a: int | str) -> Literal[4]:
-    "Another."
-    return f"{a + 5}" + "6"
-"""
-    assert changes(code) == set()
-
-
-def test_the_copy_has_every_compiled_module(tmp_path):
-    mutants.copy_of_the_project(tmp_path)
-    sources = sorted(path.relative_to(ROOT) for path in ROOT.glob("*/*/*.pyx"))
-
-    assert sources
-    for source in sources:
-        assert list((tmp_path / source).parent.glob(f"{source.stem}.*.so")), source
-
-
 @pytest.mark.slow
 def test_the_list_names_existing_modules_tests_and_mutants():
-    plan = mutants.read_plan()
-    for module, tests in plan.tests.items():
-        assert (ROOT / module).is_file()
-        assert (ROOT / tests[0]).is_file()
-    for (module, where, change), reason in plan.accepted.items():
-        keys = {m.key for m in mutants.mutants_of(module, (ROOT / module).read_bytes())}
-        assert (module, where, change) in keys
-        assert reason
+    for module, plan in tomllib.loads(mutants.PLAN.read_text("utf-8")).items():
+        assert all((ROOT / test).is_file() for test in plan["tests"])
+        found = {m.change for m in mutants.mutants_of((ROOT / module).read_bytes())}
+        assert set(plan.get("accepted", ())) <= found

@@ -23,11 +23,9 @@ from math_core import LatexError, LatexToMathML
 from mortarbench.solvers import SOLVERS
 
 sys.path.append(str(Path(__file__).parent))
-from solver_page import solver_page
+from solver_page import solver_page, table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
@@ -136,14 +134,6 @@ def from_root(text: str) -> str:
     for name, page in PAGES.items():
         text = text.replace(f"]({name}", f"]({page}")
     return text
-
-
-def table(*rows: Iterable[str]) -> str:
-    """Return a Markdown table; the first row contains the heads of the columns."""
-    lines = [
-        f"| {' | '.join(c.replace('|', chr(92) + '|') for c in r)} |" for r in rows
-    ]
-    return "\n".join([lines[0], re.sub(r"[^|]+", " --- ", lines[0]), *lines[1:]])
 
 
 def family_page() -> str:
@@ -293,7 +283,6 @@ def gallery_page(path: Path) -> dict[str, str | bytes]:
             notebook, {"metadata": {"path": folder}}
         )
     exporter = MarkdownExporter()
-    prefix = f"{path.stem}_"
     text, resources = exporter.from_notebook_node(
         notebook, {"unique_key": path.stem, "output_files_dir": ""}
     )
@@ -301,10 +290,6 @@ def gallery_page(path: Path) -> dict[str, str | bytes]:
     text = re.sub(r"<style scoped>.*?</style>", "", text, flags=re.S)
     text = text.replace('<table border="1" class="dataframe">', "<table>")
     title, _, rest = text.lstrip().partition("\n")
-    files: dict[str, str | bytes] = {
-        f"gallery/{path.stem}.md": f"{title}\n\n{note}{rest}"
-    }
-    for name, content in resources["outputs"].items():
-        files[f"gallery/{name}"] = content
-    assert all(name.startswith(prefix) for name in resources["outputs"])
-    return files
+    page = f"{title}\n\n{note}{rest}"
+    pictures = {f"gallery/{name}": data for name, data in resources["outputs"].items()}
+    return {f"gallery/{path.stem}.md": page, **pictures}

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
-from collections.abc import Iterator, Mapping
-from functools import cache
-from textwrap import dedent
+import re
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from mortarbench import listing
@@ -28,83 +26,58 @@ command that installs the library; `make setup` installs all libraries (the extr
 `fleet`). Beside the options listed here, a solver of a library has every setting of its
 library under the library's own name.
 """
+#: field of a class with a comment ``#:`` on its last line
+FIELD = re.compile(r"^    (\w+): [^#\n]*(?:\n {8}[^#\n]*)?  #: (.*)$", re.MULTILINE)
+
+
+def table(*rows: Iterable[str]) -> str:
+    """Return a Markdown table; the first row contains the heads of the columns."""
+    lines = [
+        f"| {' | '.join(c.replace('|', chr(92) + '|') for c in r)} |" for r in rows
+    ]
+    return "\n".join([lines[0], re.sub(r"[^|]+", " --- ", lines[0]), *lines[1:]])
 
 
 def solver_page(solvers: Mapping[str, Solver]) -> str:
     """Return the Markdown page on the solvers of a registry: a table, and sections."""
     groups: dict[type, list[str]] = {}
+    rows = [("name", "library", "method", "licence", "sequences")]
     for name, solver in solvers.items():
         groups.setdefault(type(solver), []).append(name)
-    sections = (_section(kind, names, solvers) for kind, names in groups.items())
-    return "\n".join([HEAD, *_overview(solvers), *sections])
-
-
-def _overview(solvers: Mapping[str, Solver]) -> Iterator[str]:
-    yield "| name | library | method | licence | sequences |"
-    yield "| --- | --- | --- | --- | --- |"
-    for name, solver in solvers.items():
         facts = listing.about(solver)
-        cells = (
-            [facts.title, facts.method, facts.licence] if facts else ["ours", "", ""]
-        )
-        chains = "yes" if hasattr(solver, "chain") else "no"
-        yield f"| `{name}` | {' | '.join(cells)} | {chains} |"
-    yield ""
+        cells = (facts.title, facts.method, facts.licence) if facts else ("", "", "")
+        rows.append((f"`{name}`", *cells, "yes" if hasattr(solver, "chain") else "no"))
+    parts = [HEAD, table(*rows)]
+    for kind, names in groups.items():
+        parts += _section(kind, {name: solvers[name] for name in names})
+    return "\n\n".join(parts) + "\n"
 
 
-def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str:
-    facts = listing.about(solvers[names[0]])
-    title = facts.title if facts else kind.__name__
-    lines = [f"## {title}", "", dedent(inspect.getdoc(kind) or ""), ""]
+def _section(kind: type, solvers: Mapping[str, Solver]) -> list[str]:
+    """Return title, docstring, facts and options of the solvers of a class."""
+    facts = listing.about(next(iter(solvers.values())))
+    parts = [
+        f"## {facts.title if facts else kind.__name__}",
+        inspect.getdoc(kind) or "",
+    ]
     if facts:
-        rows = {
-            "Install": f"`pip install {facts.package}`" if facts.package else "",
-            "Method": facts.method,
-            "Licence": facts.licence,
+        lines = {
+            "Install": facts.package and f"`pip install {facts.package}`",
             "Linear solver": facts.linear_solver,
             "Phases": facts.phases,
             "Sequences": facts.sequence,
+            "Known limits": " ".join(facts.limits),
         }
-        lines += [f"- {key}: {value}." for key, value in rows.items() if value]
-        if facts.limits:
-            lines += ["", "Known limits:", "", *(f"- {x}" for x in facts.limits)]
-        lines.append("")
-    lines += _options(kind, names, solvers)
-    return "\n".join(lines)
-
-
-def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> list[str]:
-    """Return the table of options, with one column of values for each solver."""
-    columns = {name: options_of(solvers[name]) for name in names}
-    options = list(columns[names[0]])
-    if not options:
-        return []
+        parts.append("\n".join(f"- {key}: {v}" for key, v in lines.items() if v))
     meanings: dict[str, str] = {}
-    for base in kind.__mro__:
-        meanings = {**_own_meanings(base), **meanings}
-    heads = [f"`{name}`" for name in names]
-    lines = [
-        f"| option | {' | '.join(heads)} | |",
-        f"|---|{'---|' * (len(names) + 1)}",
-    ]
-    for option in options:
-        values = " | ".join(f"{columns[name][option]!r}" for name in names)
-        lines.append(f"| `{option}` | {values} | {meanings.get(option, '')} |")
-    return [*lines, ""]
-
-
-@cache
-def _own_meanings(kind: type) -> dict[str, str]:
-    try:
-        source = dedent(inspect.getsource(kind))
-    except (OSError, TypeError):  # the class is not defined in a file
-        return {}
-    lines = source.splitlines()
-    (body,) = ast.parse(source).body
-    return {
-        node.target.id: lines[node.end_lineno - 1].partition("#:")[2].strip()
-        for node in getattr(body, "body", ())
-        if isinstance(node, ast.AnnAssign)
-        and isinstance(node.target, ast.Name)
-        and node.end_lineno is not None
-    }
+    for base in reversed(kind.__mro__[:-1]):
+        meanings |= FIELD.findall(inspect.getsource(base))
+    values = {name: options_of(solver) for name, solver in solvers.items()}
+    if options := list(next(iter(values.values()))):
+        heads = ("option", *(f"`{name}`" for name in solvers), "")
+        rows = (
+            (f"`{o}`", *(repr(v[o]) for v in values.values()), meanings.get(o, ""))
+            for o in options
+        )
+        parts.append(table(heads, *rows))
+    return parts
