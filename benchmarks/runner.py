@@ -17,15 +17,17 @@ from pathlib import Path
 from statistics import median, quantiles
 from time import perf_counter
 
+import numpy as np
+
 from mortarbench.harness.names import assemble
 from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
-from mortarbench.harness.running.pairs import paired_ratio
 from mortarbench.harness.running.run import run
 from mortarbench.harness.suite.solver_options import NULL_SUFFIX
 from mortarbench.harness.suite.suite import Suite
 from mortarbench.harness.verify.measure import SAMPLE_SECONDS, memory_mib
+from mortarbench.reports.intervals import student
 
 PLUGIN = Path(__file__).parents[1] / "tests/support/adversaries.py"
 ACCIDENTS = PLUGIN.with_name("accidents.py")
@@ -127,9 +129,11 @@ def null(trials=40, blocks=10):
         times = {}
         for solver, repeat, seconds in watch.records:
             times.setdefault(solver, {})[repeat] = seconds
-        ratio = paired_ratio(*times.values())
-        hits += ratio.low <= 1 <= ratio.high
-        widths.append(ratio.half_width)
+        a, b = times.values()
+        logs = np.log([a[i] / b[i] for i in a.keys() & b.keys()])
+        half = student(logs.size - 1) * logs.std(ddof=1) / np.sqrt(logs.size)
+        hits += abs(logs.mean()) <= half
+        widths.append(np.expm1(half))
     print(
         f"{hits} of {trials} intervals contain 1; "
         f"median half-width {median(widths):.1%}"

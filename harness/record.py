@@ -181,11 +181,6 @@ class Record(Struct, frozen=True, kw_only=True):
         """Tolerance on which the verdict is based."""
         return self.tol if self.accuracy is None else self.accuracy
 
-    @property
-    def claims_answer(self) -> bool:
-        """True if a solution is claimed, or if a certificate verifies another claim."""
-        return self.claimed == "solved" or self.status in PROVEN
-
     def replace(self, **changes: Any) -> Record:
         """Return a copy with the fields in `changes` replaced."""
         return structs.replace(self, **changes)

@@ -40,8 +40,10 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
         with new.open("x+b") as file:
             yield file
             # without this flush, a crash after the rename could leave an empty file
-            _sync(file)
-            move_file(new, path)
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(new, path)
+            sync_folder(path.parent)
     finally:
         new.unlink(missing_ok=True)
 
@@ -63,18 +65,6 @@ def replace_file(path: Path, content: bytes) -> None:
         file.write(content)
 
 
-def move_file(whole: Path, path: Path) -> None:
-    """Rename a flushed file to `path` in the same folder, and flush the folder."""
-    os.replace(whole, path)
-    sync_folder(path.parent)
-
-
-def _sync(file: IO[bytes]) -> None:
-    """Flush a file to the disk."""
-    file.flush()
-    os.fsync(file.fileno())
-
-
 def remove_unfinished(folder: Path, own: Iterable[Path]) -> None:
     """Delete incomplete files that killed processes left in a result folder.
 
@@ -82,10 +72,8 @@ def remove_unfinished(folder: Path, own: Iterable[Path]) -> None:
 
     own : subfolders that contain only files of this package
     """
-    unfinished = [*folder.glob(_UNFINISHED)]
-    for pattern in (_UNFINISHED, "*.new"):  # the second is that of case folders
-        unfinished += [path for one in own for path in one.rglob(pattern)]
-    for path in unfinished:
+    inside = (path for one in own for path in one.rglob(_UNFINISHED))
+    for path in (*folder.glob(_UNFINISHED), *inside):
         path.unlink(missing_ok=True)
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mortarbench.harness.errors import FaultError, InputError
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.files.store import read_point
 from mortarbench.harness.plugin import Case, Reference
-from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.protocol import Source, source_of
 from mortarbench.harness.processes.scratch import scratch_folder
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory

@@ -41,11 +41,11 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from mortarbench.harness.distributed.comm import serve as serve_rank
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Solver
-from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.protocol import (
     Send,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
 import shutil
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +25,18 @@ from mortarbench.harness.files.reading import (
     read_json,
     toml,
 )
-from mortarbench.harness.suite.growth import incompatibility
+from mortarbench.harness.processes.locks import file_lock
+from mortarbench.harness.suite.growth import refuse_changed
 from mortarbench.harness.suite.suite import Suite, SuiteFile, read_stored, suite_file
 
 #: Folders and files that commands write to a result folder. ``--fresh`` deletes or
 #: overwrites only these and those in `_RESULT_FILES`.
-_FOLDERS = ("journal", "vectors", "cases", "environments", "report")
+_FOLDERS = ("journal", "vectors", "environments", "report")
 _FILES = ("environment.json", "suite.toml")
 #: results of `mortarbench validate`
 _RESULT_FILES = ("validation.json",)
 REMEDY = "choose another --out or use --fresh"
 MAX_FOLDER_DEPTH = 30  #: largest depth of nested folders; runs write three levels
-#: parts of an environment that describe the machine and its threads
-HARDWARE = ("machine", "threads", "cholmod")
 _LOCK = ".lock"
 _LOCK_CONTENT = b"held by runs of mortarbench\n"
 _DIGEST = re.compile(r"[\w.-]{1,64}")
@@ -132,31 +130,28 @@ def lock_folder(folder: Path) -> Iterator[None]:
         If another run has locked the folder, or the folder cannot be written.
 
     """
-    # O_NOFOLLOW: if the lock were a link, another file would be overwritten
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    try:
-        with report_full_disk(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            lock = os.open(folder / _LOCK, flags, 0o666)
-    except OSError as e:
-        raise InputError(
-            f"{folder}: {e.strerror}; expected a folder that can be written"
-        ) from None
-    try:
+    lock = folder / _LOCK
+    with ExitStack() as stack:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with report_full_disk(folder):
+                folder.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(
+                    file_lock(lock, flags=os.O_RDWR | os.O_CREAT, waits=False)
+                )
+                lock.write_bytes(_LOCK_CONTENT)
         except BlockingIOError:
             raise InputError(
                 f"{folder} is being written by another run; wait, or choose another "
                 "folder"
             ) from None
-        os.pwrite(lock, _LOCK_CONTENT, 0)
+        except OSError as e:
+            raise InputError(
+                f"{folder}: {e.strerror}; expected a folder that can be written"
+            ) from None
         # Unfinished files are deleted after locking, since another run may still have
         # been writing them.
         remove_unfinished(folder, [folder / name for name in _FOLDERS])
         yield
-    finally:
-        os.close(lock)
 
 
 @contextmanager
@@ -193,16 +188,12 @@ def claim(
     write_json(out / "environment.json", environment)
 
 
-def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> bool:
+def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
     """Check that a folder belongs to this suite and environment.
 
     The suite may have been extended, see `harness.suite.growth`.
 
     environment : environment, with its digest under the key ``digest``
-
-    Returns
-    -------
-    True if the suite has been extended
 
     Raises
     ------
@@ -212,15 +203,12 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
 
     """
     suite_path, environment_file = out / "suite.toml", out / "environment.json"
-    has_grown = False
     if suite_path.exists():
         try:
             old, new = read_stored(suite_path), suite_file(toml(suite.text))
+            refuse_changed(old, new, str(suite_path))
         except InputError as e:
-            raise InputError(f"{e}; restore it, or use --fresh") from None
-        has_grown = old != new
-        if has_grown and (difference := incompatibility(old, new)):
-            raise InputError(f"{out} contains another suite ({difference}); {REMEDY}")
+            raise InputError(f"{e}; {REMEDY}") from None
     if environment_file.exists():
         stored = _environment(environment_file)
         if stored["digest"] != environment["digest"]:
@@ -229,7 +217,6 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
                 f"{out} was measured in another environment ({stored['digest']}, now "
                 f"{environment['digest']}{what and f': {what}'}); {REMEDY}"
             )
-    return has_grown
 
 
 def suite_of(folder: Path) -> SuiteFile:
@@ -292,17 +279,6 @@ def differences(
             yield from ((f"{key}.{k}", *pair) for k, *pair in differences(a, b))
         elif a != b:
             yield key, a, b
-
-
-def same_machine(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return True if two environments describe the same machine, threads and BLAS.
-
-    Differences in versions, source and plug-ins are usually the subject of a comparison
-    of times. An unknown machine is not the same as any other.
-    """
-    return bool(one.get("machine")) and all(
-        one.get(part) == other.get(part) for part in HARDWARE
-    )
 
 
 def times_compare(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -8,7 +8,7 @@ file and the length of its lines.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from pathlib import Path
 from typing import Any, Self
@@ -159,6 +159,29 @@ def read_journal(
         lines = "line repeats" if repeated == 1 else "lines repeat"
         tell(f"{repeated} journal {lines} an earlier line exactly, and count once")
     return [*records.values()]
+
+
+def refuse_other_solver(
+    where: str, r: Record, method: str | None, options: Mapping[str, Any]
+) -> None:
+    """Refuse a record whose label now denotes another solver, or other options.
+
+    where : folder of the record, for the message
+    method : name of the solver that the label denotes; None for that of the record
+
+    Raises
+    ------
+    InputError
+        If the solver differs, or an option that both have.
+
+    """
+    now = {**options, "name": method or r.method}
+    for key, old in {**r.options, "name": r.method}.items():
+        if now.get(key, old) != old:
+            raise InputError(
+                f"{where} contains {r.solver} with {key} = {shown(old)}, now "
+                f"{shown(now[key])}; use a different label for other options"
+            )
 
 
 def _records(path: Path) -> Iterator[tuple[int, Record]]:

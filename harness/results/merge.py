@@ -26,7 +26,7 @@ from mortarbench.harness.results.folder import (
     refuse_foreign,
     write_json,
 )
-from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.results.journal import read_journal, refuse_other_solver
 from mortarbench.harness.suite.growth import unite
 from mortarbench.harness.suite.suite import as_toml, read_stored
 
@@ -46,10 +46,11 @@ def merge(
     ------
     InputError
         If a source contains no measurements, or contains a link; if two folders contain
-        different records of one measurement; if the suites differ in settings on which
-        measurements depend; if `out` is a source, lies in a source, or contains a
-        source; if `out` contains results of a run or files of the user; or if the disk
-        is full. In these cases, the journal of `out` does not change.
+        different records of one measurement, or different solvers under one label; if
+        the limits or accuracies of the suites differ; if `out` is a source, lies in a
+        source, or contains a source; if `out` contains results of a run or files of the
+        user; or if the disk is full. In these cases, the journal of `out` does not
+        change.
 
     """
     for source in sources:
@@ -74,6 +75,11 @@ def merge(
             "--out"
         )
     folders = [*[out] * journal.exists(), *journals]
+    labels: dict[str, Record] = {}
+    for folder in folders:
+        for r in journals.get(folder) or read_journal(folder):
+            first = labels.setdefault(r.solver, r)
+            refuse_other_solver(str(folder), r, first.method, first.options)
     paths = {str(folder): folder / "suite.toml" for folder in folders}
     suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
     suite = as_toml(unite(suites)) if suites else ""

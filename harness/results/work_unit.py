@@ -81,7 +81,6 @@ class MeasurementFault:
 
 Outcome = Result | BuildFailure | MeasurementFault
 
-#: Function that executes blocks with commands, in a scratch folder and with a folder of
-#: built cases (`harness.processes.case_folder`). It takes as few blocks as possible in
-#: advance, since blocks depend on the outcomes of earlier ones.
-Execute = Callable[[Iterator[WorkUnit], Commands, Path, Path], Generator[Outcome]]
+#: Function that executes blocks with commands, in a scratch folder. It takes as few
+#: blocks as possible in advance, since blocks depend on the outcomes of earlier ones.
+Execute = Callable[[Iterator[WorkUnit], Commands, Path], Generator[Outcome]]

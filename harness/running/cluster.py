@@ -12,7 +12,6 @@ import logging
 import os
 import signal
 import sys
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -122,7 +121,7 @@ class Cluster:
     _stored: set[str] = field(default_factory=set)  # digests of stored environments
 
     def execute(
-        self, blocks: Iterator[WorkUnit], commands: Commands, scratch: Path, cases: Path
+        self, blocks: Iterator[WorkUnit], commands: Commands, scratch: Path
     ) -> Generator[Outcome]:
         """Execute all blocks, and yield the outcomes of a block when it is complete.
 
@@ -176,14 +175,12 @@ class Cluster:
         """Return the function that measures a block in a Dask worker."""
         from mortarbench.harness.running.dask_worker import measure
 
-        info = self.client.scheduler_info(n_workers=-1)["workers"].values()
         return partial(
             measure,
             run=self.client.id,
             commands=commands,
             plugins=tuple(file.resolved() for file in self.plugins),
             operators=dict(self.operators),
-            sharing=max(Counter(worker["host"] for worker in info).values()),
             packages=tuple(packages_of(self.environment)),
         )
 

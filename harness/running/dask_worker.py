@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import platform
 from collections.abc import Mapping
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -20,9 +19,12 @@ from mortarbench.harness.environment.environment import capture_in, digest
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.operators import Maker
+from mortarbench.harness.processes.locks import file_lock
 from mortarbench.harness.registry import PluginFile, load_plugin, merged
 from mortarbench.harness.results.work_unit import Commands, Outcome, WorkUnit
 from mortarbench.harness.running.executor import Executor
+
+_LOCKS = ExitStack()  # locks that this process holds until it ends
 
 
 def measure(
@@ -32,18 +34,15 @@ def measure(
     commands: Commands,
     plugins: tuple[PluginFile, ...],
     operators: Mapping[str, Maker],
-    sharing: int,
     packages: tuple[str, ...],
 ) -> tuple[list[Outcome], str, dict[str, Any]]:
     """Measure a block in a Dask worker; stop early if the run has ended.
 
     run : name that no other run on the cluster has
     operators : makers of operators P, except those of the plug-ins
-    sharing : largest number of Dask workers on one machine, which disturb each other
     packages : packages whose versions an environment contains
 
-    The CPU of this Dask worker also measures the blocks of its other runs. Built cases
-    remain in the folder of the Dask worker until it ends.
+    The CPU of this Dask worker also measures the blocks of its other runs.
 
     Returns
     -------
@@ -62,15 +61,7 @@ def measure(
             "blocks at a time, so that they would disturb each other; start it with "
             "--nthreads 1"
         )
-    for path in (Path(commands.case_worker[0]), *(p.path for p in plugins)):
-        if not path.is_file():
-            raise InputError(
-                f"{node}: no file {path}; expected the same interpreter and plug-ins "
-                "under the same paths on every node"
-            )
     environment = _environment(run, plugins, packages)
-    if sharing > 1:
-        environment["machine"]["shared_by_workers"] = sharing
     name = digest(environment)
     for file in plugins:
         operators = merged("operator", operators, load_plugin(file).operators)
@@ -84,7 +75,7 @@ def measure(
     scratch.mkdir(exist_ok=True)
     task = worker.state.tasks[worker.get_current_task()]
     outcomes: list[Outcome] = []
-    executor = Executor(commands, scratch, scratch / "cases", operators)
+    executor = Executor(commands, scratch, operators)
     with closing(executor):
         try:
             for outcome in executor.execute(replace(block, turns=turns)):
@@ -119,14 +110,12 @@ def claim_cpu() -> int:
     usable = fastest_first(os.sched_getaffinity(os.getpid()))
     for cpu in usable:
         lock = Path(gettempdir(), f"mortarbench-{os.getuid()}-cpu{cpu}.lock")
-        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        with suppress(OSError):  # a link, or a file of another user
-            fd = os.open(lock, flags, 0o600)
-            try:
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return cpu
-            except BlockingIOError:
-                os.close(fd)
+        # the CPU is in use, or the file is a link or belongs to another user
+        with suppress(OSError):
+            _LOCKS.enter_context(
+                file_lock(lock, flags=os.O_RDWR | os.O_CREAT, waits=False)
+            )
+            return cpu
     raise InputError(
         f"{platform.node()} has {len(usable)} usable CPUs, and as many Dask workers "
         "use them already; start fewer workers"

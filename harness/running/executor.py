@@ -7,14 +7,14 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mortarbench.harness.errors import FaultError
 from mortarbench.harness.files.durable import refuse_full_disk, report_full_disk
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays
 from mortarbench.harness.operators import NO_MAKERS, Maker
-from mortarbench.harness.processes.case_folder import StoredCase, find_or_build
 from mortarbench.harness.processes.measurement import case_request, measure_and_judge
 from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.supervisor import WorkerProcess
@@ -32,23 +32,28 @@ from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.verdicts import has_point, noted
 
 
+class BuiltCase(NamedTuple):
+    """Case that the case worker has built."""
+
+    qp: Path  #: file that contains the QP, see `harness.files.qpfile`
+    digest: str  #: digest of the content of that file
+    meta: Mapping[str, Any]  #: meta data of the QP, see `harness.processes.cases`
+
+
 @dataclass(eq=False)
 class Executor:
     """Sequential executor of blocks, with one worker process per solver.
 
     scratch : folder of temporary files that only this executor uses
-    cases : cache of built cases, see `harness.processes.case_folder`, which several
-        executors may share
     operators : makers of operators P by name, see `harness.operators`
     """
 
     commands: Commands
     scratch: Path
-    cases: Path
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     _workers: dict[str, WorkerProcess] = field(default_factory=dict)
-    _entries: tuple[StoredCase, ...] = ()  # cases of that block, once they are built
-    _keep: int = 1  # number of cases that the case worker keeps in memory
+    _names: tuple[str, ...] = ()  # names of the cases of the last block
+    _entries: tuple[BuiltCase, ...] = ()  # those cases, once they are built
     # reason why the sequence has fewer cases than requested steps; else empty
     _end_reason: str = ""
     _loaded: dict[str, QP] = field(default_factory=dict)  # QPs of `_entries`, by digest
@@ -74,7 +79,8 @@ class Executor:
         """
         with report_full_disk(self.scratch):
             try:
-                self._entries, self._keep = (), len(block.cases)
+                if self._names != block.cases:
+                    self._names, self._entries = block.cases, ()
                 for turn in block.turns:
                     yield from self._turn(block, turn)
             except _BuildError as e:
@@ -194,11 +200,14 @@ class Executor:
         """
         if self._entries:
             return
-        entries: list[StoredCase] = []
+        entries: list[BuiltCase] = []
         self._end_reason = ""
-        for record in turn:
+        for step, record in enumerate(turn):
+            path = self.scratch / f"qp{step}"
+            request = {"build": _case(record), "qp": str(path)}
             try:
-                entries.append(self._entry(record))
+                meta = self._ask_case_worker(request)["meta"]
+                entries.append(BuiltCase(path, content_digest(path), meta))
             except _BuildError as e:
                 if not entries or not e.past_end:
                     raise
@@ -233,16 +242,6 @@ class Executor:
             record=noted(record, *notes), point=point_arrays(solution), fields=stored
         )
 
-    def _entry(self, record: Record) -> StoredCase:
-        def make(path: Path) -> Mapping[str, Any]:
-            request = {"build": _case(record), "qp": str(path)}
-            meta: Mapping[str, Any] = self._ask_case_worker(request)["meta"]
-            return meta
-
-        r = record
-        identity = [r.family, r.params, r.form, r.environment]
-        return find_or_build(self.cases, identity, make)
-
     def _ask_case_worker(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         """Send a request to build or to evaluate a case, and return the answer.
 
@@ -258,7 +257,7 @@ class Executor:
         # may have crashed it
         for _ in range(2):
             reply = self._case_worker.ask(
-                {**request, "keep": self._keep},
+                {**request, "keep": len(self._names)},
                 time_limit=inf,
                 memory_limit=inf,
             )
@@ -286,7 +285,7 @@ class Executor:
             self._workers[label] = WorkerProcess(self.commands.solvers[label], log)
         return self._workers[label]
 
-    def _qp(self, entry: StoredCase) -> QP:
+    def _qp(self, entry: BuiltCase) -> QP:
         if entry.digest not in self._loaded:
             self._loaded[entry.digest] = load_qp(entry.qp, operators=self.operators)[0]
         return self._loaded[entry.digest]
@@ -300,12 +299,11 @@ def execute(
     blocks: Iterator[WorkUnit],
     commands: Commands,
     scratch: Path,
-    cases: Path,
     *,
     operators: Mapping[str, Maker] = NO_MAKERS,
 ) -> Generator[Outcome]:
     """Execute blocks one after the other on this machine, see `Executor`."""
-    with closing(Executor(commands, scratch, cases, operators)) as executor:
+    with closing(Executor(commands, scratch, operators)) as executor:
         for block in blocks:
             yield from executor.execute(block)
 

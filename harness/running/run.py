@@ -15,7 +15,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.files.store import save
 from mortarbench.harness.plugin import Solver
@@ -30,7 +30,11 @@ from mortarbench.harness.results.folder import (
     refuse_other,
     scratch_in,
 )
-from mortarbench.harness.results.journal import Journal, read_journal
+from mortarbench.harness.results.journal import (
+    Journal,
+    read_journal,
+    refuse_other_solver,
+)
 from mortarbench.harness.results.work_unit import (
     BuildFailure,
     Commands,
@@ -100,12 +104,10 @@ def run(
         options = {s.label: options_of(resolve(s)) for s in suite.solvers}
         past: list[Record] = []
         if not fresh:
-            has_grown = refuse_other(out, suite, environment)
+            refuse_other(out, suite, environment)
             has_journal = next((out / "journal").glob("*.jsonl"), None) is not None
             past = read_journal(out) if has_journal else []
             _check_same(out, past, suite, options)
-            if has_grown:
-                _check_steps(out, past, suite)
         claim(out, suite, environment, fresh=fresh)
         with (
             scratch_in(out) as scratch,
@@ -127,9 +129,7 @@ def run(
                 schedule=schedule,
                 progress=progress,
             )
-            outcomes = execute(
-                schedule.blocks(), commands, scratch, out.resolve() / "cases"
-            )
+            outcomes = execute(schedule.blocks(), commands, scratch)
             with contextlib.closing(outcomes):
                 for outcome in outcomes:
                     recorder.take(outcome)
@@ -232,57 +232,21 @@ def _check_same(
     Raises
     ------
     InputError
-        If a solver label now has different options, a case is no longer in the suite,
-        or a parameter of a case, such as the digest of its file, has changed.
+        If a solver label now has another solver or other options, or a parameter of a
+        case, such as the digest of its file, has changed.
 
     """
-    now = {case.name: case.params for case in suite.names}
+    cases = {case.name: case.params for case in suite.names}
+    methods = {spec.label: spec.name for spec in suite.solvers}
     configured = {label: finite(plain(value)) for label, value in options.items()}
-    for record in past:
-        if suite.every and record.case not in suite.every:
-            raise InputError(
-                f"{out} contains {record.case}, which is no longer in the suite; "
-                f"cases may only be added; --case selects cases of a run; {REMEDY}"
-            )
-        today = configured.get(record.solver, record.options)
-        for key in today.keys() | record.options.keys():
-            old, new = record.options.get(key), today.get(key)
-            if old != new:
-                raise InputError(
-                    f"{out} contains {record.solver} with {key} = {shown(old)}, now "
-                    f"{shown(new)}; use a different label for other options"
-                )
-        params = now.get(record.case, record.params)
-        for key in params.keys() & record.params.keys():
-            if record.params[key] != params[key]:
-                raise InputError(
-                    f"{out} contains {record.case} with {key} = {record.params[key]}, "
-                    f"now {params[key]}; {REMEDY}"
-                )
-
-
-def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
-    """Check that no step of a sequence was inserted before steps already measured.
-
-    A solver carries data from step to step, so the measured results would not be
-    results of the new sequence.
-
-    Raises
-    ------
-    InputError
-        If a step was inserted.
-
-    """
-    measured: dict[tuple[str, str, float, int], list[str]] = {}
     for r in past:
-        if r.mode != "cold":
-            measured.setdefault((r.mode, r.solver, r.tol, r.repeat), []).append(r.case)
-    for sequence in suite.sequences:
-        steps = [case.name for case in sequence]
-        for cases in measured.values():
-            common = [case for case in cases if case in steps]
-            if common != steps[: len(common)]:
+        refuse_other_solver(
+            str(out), r, methods.get(r.solver), configured.get(r.solver, r.options)
+        )
+        params = cases.get(r.case, r.params)
+        for key in params.keys() & r.params.keys():
+            if r.params[key] != params[key]:
                 raise InputError(
-                    f"{out} contains a sequence that reached {common[-1]} by "
-                    f"different steps; steps may be added at its end; {REMEDY}"
+                    f"{out} contains {r.case} with {key} = {r.params[key]}, "
+                    f"now {params[key]}; {REMEDY}"
                 )

@@ -101,7 +101,6 @@ class Suite:
     lines: tuple[tuple[str, ...], ...] = ()
     #: tolerance of the verdicts; None for the tolerance that is passed to the solver
     accuracy: float | None = None
-    every: frozenset[str] = frozenset()  #: names of all cases, regardless of ``--case``
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -164,7 +163,6 @@ def parse_suite(
             if not getattr(file, key):
                 raise InputError(f"{key} is missing or empty; expected a list")
         cases = expand_problems(file.problems, families, folder, file.max_cases)
-        groups = (cases.cold, *cases.sequences)
         return Suite(
             name=file.name,
             tolerances=file.tolerances,
@@ -177,7 +175,6 @@ def parse_suite(
             cases=cases.cold,
             sequences=cases.sequences,
             lines=cases.lines,
-            every=frozenset(case.name for group in groups for case in group),
         )
 
 

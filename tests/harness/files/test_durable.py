@@ -16,7 +16,6 @@ import pytest
 from mortarbench.cli.main import main
 from mortarbench.harness import InputError
 from mortarbench.harness.errors import FaultError
-from mortarbench.harness.files import durable
 from mortarbench.harness.files.durable import (
     refuse_full_disk,
     remove_unfinished,
@@ -101,16 +100,16 @@ def test_a_failure_is_attributed_to_the_disk_if_it_is_full(tmp_path):
 
 
 def test_only_unfinished_files_of_writers_are_removed(tmp_path):
-    own = [tmp_path / name for name in ("vectors", "cases", "report/tables", "none")]
-    for folder in own[:3]:
+    own = [tmp_path / name for name in ("vectors", "report/tables", "none")]
+    for folder in own[:2]:
         folder.mkdir(parents=True)
     ours = [
-        ".mortarbench-0123.tmp", "cases/k.new", "report/tables/.mortarbench-4567.tmp",
+        ".mortarbench-0123.tmp", "report/tables/.mortarbench-4567.tmp",
     ]  # fmt: skip
-    others = ["notes.tmp", "cases/k.npz", "cases/k.lock", "report/tables/a.tex"]
+    others = ["notes.tmp", "vectors/k.npz", "report/tables/a.tex"]
     for name in (*ours, *others):
         (tmp_path / name).touch()
-    remove_unfinished(tmp_path, [*own[:2], tmp_path / "report", own[3]])
+    remove_unfinished(tmp_path, [own[0], tmp_path / "report", own[2]])
 
     files = (p for p in tmp_path.rglob("*") if p.is_file())
     assert sorted(str(p.relative_to(tmp_path)) for p in files) == sorted(others)
@@ -201,16 +200,16 @@ def test_a_terminated_export_leaves_no_partial_file(
     """The signal arrives when all bytes are written, but the file is not
     yet renamed.
     """
-    path, sync, part = tmp_path / f"qp{suffix}", durable._sync, []
+    path, sync, part = tmp_path / f"qp{suffix}", os.fsync, []
     if before is not None:
         path.write_bytes(before)
 
-    def end(file):
-        sync(file)
+    def end(fd):
+        sync(fd)
         part.extend(p.stat().st_size for p in tmp_path.iterdir() if p != path)
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(durable, "_sync", end)
+    monkeypatch.setattr(os, "fsync", end)
     with pytest.raises(SystemExit) as e:
         main(Registries(), ["export", "obstacle/dim=1/n=4/primal", str(path)])
 

@@ -198,7 +198,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
 ):
     names = kinds_of_files(folder_of_run)
     assert {name.partition("/")[0].partition(".")[0] for name in names} >= {
-        "journal", "vectors", "cases", "report", "environments",
+        "journal", "vectors", "report", "environments",
         "environment", "suite", "validation", "",
     }  # fmt: skip
     for i, name in enumerate(names):
@@ -222,7 +222,7 @@ def folder_copy(folder_of_run, tmp_path):
         "vectors",
         *(
             pytest.param(part, marks=pytest.mark.slow)
-            for part in ("journal", ".scratch", "report", "cases")
+            for part in ("journal", ".scratch", "report")
         ),
     ],
 )  # fmt: skip

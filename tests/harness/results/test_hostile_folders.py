@@ -151,7 +151,7 @@ def test_commands_read_nothing_outside_the_folder_for_malformed_digests(
 
 
 LINKS = (
-    "journal", "vectors", "cases", "environments", "report", ".scratch",
+    "journal", "vectors", "environments", "report", ".scratch",
     "environment.json", "suite.toml", "validation.json", "validation.tmp", ".lock",
     "report/index.html", "report/report.md", "report/figures",
     "report/tables/evil", "vectors/evil.npz",

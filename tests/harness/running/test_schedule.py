@@ -4,14 +4,12 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import numpy as np
 import pytest
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.names import assemble
 from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
-from mortarbench.harness.running.pairs import paired_ratio
 from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.suite import Suite
 
@@ -114,26 +112,6 @@ def test_a_case_that_cannot_be_built_is_omitted_from_later_blocks():
     assert schedule.give_up(failed)
     assert not schedule.give_up(failed)  # the case was given up before
     assert [b.cases for b in blocks] == 3 * [("f/n=2/p",)]
-
-
-def test_the_paired_interval_has_its_nominal_coverage():
-    rng = np.random.default_rng(314159)
-    hits = 0
-    for _ in range(2000):
-        # drift of the machine, which affects whole blocks
-        drift = np.exp(rng.standard_normal(8))
-        a, b = (drift * np.exp(0.1 * rng.standard_normal(8)) * s for s in (3.0, 1.0))
-        r = paired_ratio(dict(enumerate(a)), dict(enumerate(b)))
-        hits += r.low <= 3.0 <= r.high
-
-    assert hits / 2000 == pytest.approx(0.95, abs=0.015)
-
-
-def test_only_common_blocks_are_compared():
-    r = paired_ratio({0: 2.0, 1: 8.0, 5: 1e9}, {0: 1.0, 1: 4.0, 7: 1e-9})
-
-    assert (r.value, r.pairs) == (pytest.approx(2.0), 2)
-    assert paired_ratio({0: 1.0}, {0: 1.0}) is None
 
 
 @pytest.mark.parametrize(

@@ -3,60 +3,47 @@
 import pytest
 
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.suite.growth import incompatibility, unite
+from mortarbench.harness.suite.growth import refuse_changed, unite
 from mortarbench.harness.suite.suite import suite_file
 
 SUITE = {
     "name": "s", "tolerances": [1e-6, 1e-8], "repeats": 3, "time_limit": 60,
     "solvers": ["a", {"name": "b", "label": "b-50", "options": {"max_iter": 50}}],
+    "problems": [{"family": "f", "params": {"step": [1, 2]}, "sequence": "step"}],
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(
     "more",
     [
-        {},
         {"time_limit": 60.0, "memory_limit": 4096},  # equal to the defaults
-        {"solvers": [*SUITE["solvers"], "c"]},
-        {"solvers": SUITE["solvers"][::-1]},
-        {"tolerances": [1e-4, 1e-6, 1e-8]},
-        {"repeats": 5},
-        {"null_arm": "a"},
+        {"solvers": [*SUITE["solvers"][::-1], "c"]},
+        {"tolerances": [1e-4, 1e-6, 1e-8], "repeats": 5, "null_arm": "a"},
+        {"problems": [*SUITE["problems"], {"family": "g"}]},
     ],
 )
-def test_an_extended_suite_counts_as_the_same_suite(more):
-    assert incompatibility(suite_file(SUITE), suite_file(SUITE | more)) == ""
+def test_a_suite_may_be_extended(more):
+    refuse_changed(suite_file(SUITE), suite_file(SUITE | more), "here")
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"name": "t"}, "name was 's', now 't'"),
-        ({"time_limit": 5}, "time_limit was 60, now 5"),
-        ({"repeats": 2}, "repeats was 3, now 2; it may only grow"),
-        ({"tolerances": [1e-8]}, "tolerance 1e-06 is missing; tolerances may be added"),
-        ({"solvers": ["a"]}, "solver 'b-50' is missing; solvers may be added"),
+        ({"name": "t"}, "name is 's' in here, 't' in the suite"),
+        ({"time_limit": 5}, "time_limit is 60 in here, 5 in the suite"),
+        ({"accuracy": 1e-8}, "accuracy is None in here, 1e-08 in the suite"),
         (
-            {"solvers": ["a", {"name": "c", "label": "b-50"}]},
-            "solver 'b-50' was 'b', now 'c'",
+            {"problems": [SUITE["problems"][0] | {"params": {"step": [1, 3]}}]},
+            "here has a sequence of f along step that the suite lacks",
         ),
     ],
 )
 def test_settings_of_past_measurements_may_not_change(change, said):
-    assert incompatibility(suite_file(SUITE), suite_file(SUITE | change)) == said
+    with pytest.raises(InputError, match=said):
+        refuse_changed(suite_file(SUITE), suite_file(SUITE | change), "here")
 
 
-def test_a_null_arm_may_not_be_removed():
-    with_copy, without = suite_file(SUITE | {"null_arm": "a"}), suite_file(SUITE)
-    assert incompatibility(with_copy, without) == "null_arm was 'a', now not set"
-
-
-def test_a_conflict_of_labels_names_the_two_folders_in_conflict():
-    """The folder without the label is not blamed, although it comes first."""
-    tables = {
-        "a": {"solvers": ["piqp"]},
-        "b": {"solvers": [{"name": "osqp", "label": "mine"}]},
-        "c": {"solvers": [{"name": "clarabel", "label": "mine"}]},
-    }
-    with pytest.raises(InputError, match=r"'osqp'} in b, .*'clarabel'} in c;"):
-        unite({k: suite_file({"name": "s", **v}) for k, v in tables.items()})
+def test_suites_with_other_limits_are_not_united():
+    other = suite_file(SUITE | {"memory_limit": 100})
+    with pytest.raises(InputError, match="memory_limit is 4096 in a, 100 in b;"):
+        unite({"a": suite_file(SUITE), "b": other})
