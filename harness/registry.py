@@ -164,7 +164,8 @@ class Plugin:
 class Registry(Mapping[str, T]):
     """Mapping of names to objects; "MODULE:NAME" is imported on first access.
 
-    If NAME is a class, it is instantiated.
+    If NAME is a class, it is instantiated. Entry points of installed packages are read
+    when a name is not among the other entries, or when all names are listed.
 
     >>> from mortarbench.harness.registry import Registry
     >>> registry = Registry({"half": "fractions:Fraction"})
@@ -178,16 +179,30 @@ class Registry(Mapping[str, T]):
         self,
         entries: Mapping[str, str | T],
         check: Callable[[object], None] = lambda _: None,
+        group: str = "",
     ) -> None:
         """Store the entries.
 
         check : function that raises `InputError` if an imported object has a wrong type
+        group : group of entry points of installed packages; "" for none
         """
-        self.entries = dict(entries)
+        self._entries = dict(entries)
+        self._group = group
         self.check = check
 
+    @property
+    def entries(self) -> dict[str, str | T]:
+        """All entries by name, including those of installed packages."""
+        if self._group:
+            new = entry_points_of(self._group)
+            _refuse_taken(self._group.rpartition(".")[2][:-1], self._entries, new)
+            self._entries |= new
+            self._group = ""
+        return self._entries
+
     def __getitem__(self, name: str) -> T:
-        if not isinstance(entry := self.entries[name], str):
+        entries = self._entries if name in self._entries else self.entries
+        if not isinstance(entry := entries[name], str):
             return entry
         module, _, attribute = entry.partition(":")
         try:
@@ -199,11 +214,11 @@ class Registry(Mapping[str, T]):
             thing = thing()
         with located(f"{entry}, registered as {name!r}"):
             self.check(thing)
-        self.entries[name] = thing
+        entries[name] = thing
         return thing  # type: ignore[no-any-return]
 
     def __contains__(self, name: object) -> bool:
-        return name in self.entries
+        return name in self._entries or name in self.entries
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.entries)
@@ -401,6 +416,12 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, Any]) -> Registr
         If both contain the same name, which would make results ambiguous.
 
     """
+    _refuse_taken(what, known, new)
+    registry = known if isinstance(known, Registry) else Registry(known)
+    return Registry({**registry.entries, **new}, registry.check) if new else registry
+
+
+def _refuse_taken(what: str, known: Mapping[str, Any], new: Mapping[str, Any]) -> None:
     if both := sorted(known.keys() & new.keys()):
         remedy = (
             "label its plug-in by --plugin LABEL=FILE.py"
@@ -411,8 +432,6 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, Any]) -> Registr
             f"{what} {both[0]!r} of the plug-in already exists; rename the new one, or "
             f"{remedy}"
         )
-    registry = known if isinstance(known, Registry) else Registry(known)
-    return Registry({**registry.entries, **new}, registry.check) if new else registry
 
 
 @contextmanager

@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 #: output and the registered modules.
 TURN = ForkSafeLock()
 
-_PROBLEMS, _SOLVERS = "mortarbench.problems", "mortarbench.solvers"  # entry points
-
 #: Python files that define SOLVERS or PROBLEMS; a string may have the form
 #: LABEL=FILE.py. The text is the option of commands
 Plugins = Annotated[Sequence[str | Path | PluginFile], "--plugin [LABEL=]FILE.py"]
@@ -227,6 +225,8 @@ class Registries:
             and self.solvers is SOLVERS
             and self.operators is OPERATORS
             and not self.files
+            and not entry_points_of("mortarbench.problems")
+            and not entry_points_of("mortarbench.solvers")
         )
 
     def worker_command(
@@ -332,24 +332,6 @@ def with_history(spec: SolverSpec, solvers: Mapping[str, Solver]) -> SolverSpec:
     return replace(spec, options={**spec.options, "history": True})
 
 
-def installed(registries: Registries) -> Registries:
-    """Return registries extended by the plug-ins of installed packages (entry points).
-
-    A plug-in is imported when its name is used.
-
-    Raises
-    ------
-    InputError
-        If a name in a plug-in exists already.
-
-    """
-    return replace(
-        registries,
-        families=merged("problem", registries.families, entry_points_of(_PROBLEMS)),
-        solvers=merged("solver", registries.solvers, entry_points_of(_SOLVERS)),
-    )
-
-
 @TURN
 def load_registries(
     plugins: Plugins = (), registries: Registries | None = None
@@ -366,7 +348,7 @@ def load_registries(
 
     """
     if registries is None:
-        return installed(Registries()).with_files(plugins)
+        return Registries().with_files(plugins)
     if not isinstance(registries, Registries):
         raise InputError(f"registries = {shown(registries)}; expected Registries")
     return registries

@@ -35,6 +35,7 @@ _FAMILIES = {
 PROBLEMS: Registry[Family] = Registry(
     {name: f"mortarbench.problems.families.{at}" for name, at in _FAMILIES.items()},
     check_family,
+    "mortarbench.problems",
 )
 
 #: mapping from the name of an operator to the function that restores it as the Hessian

@@ -39,4 +39,5 @@ _PLACES = {
 SOLVERS: Registry[Solver] = Registry(
     {name: f"mortarbench.solvers.{place}" for name, place in _PLACES.items()},
     check_solver,
+    "mortarbench.solvers",
 )

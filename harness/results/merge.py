@@ -75,11 +75,7 @@ def merge(
             "--out"
         )
     folders = [*[out] * journal.exists(), *journals]
-    labels: dict[str, Record] = {}
-    for folder in folders:
-        for r in journals.get(folder) or read_journal(folder):
-            first = labels.setdefault(r.solver, r)
-            refuse_other_solver(str(folder), r, first.method, first.options)
+    _check_labels({f: journals.get(f) or read_journal(f) for f in folders})
     paths = {str(folder): folder / "suite.toml" for folder in folders}
     suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
     suite = as_toml(unite(suites)) if suites else ""
@@ -105,6 +101,15 @@ def merge(
         lines = "".join(f"{r.to_json()}\n" for r in merged)
         replace_file(journal, lines.encode())
     return merged
+
+
+def _check_labels(journals: Mapping[Path, Sequence[Record]]) -> None:
+    """Raise InputError if a label has different solvers or options in two folders."""
+    labels: dict[str, Record] = {}
+    for folder, records in journals.items():
+        for r in records:
+            first = labels.setdefault(r.solver, r)
+            refuse_other_solver(str(folder), r, first.method, first.options)
 
 
 def _united(

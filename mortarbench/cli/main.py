@@ -23,7 +23,7 @@ import mortarbench
 from mortarbench.cli.parser import Parser
 from mortarbench.harness.errors import InputError, one_line
 from mortarbench.harness.processes.termination import TerminatedError, ended_by_signals
-from mortarbench.registries import Registries, defer_parts_of_numpy, installed
+from mortarbench.registries import Registries, defer_parts_of_numpy
 
 #: Function in `mortarbench.cli` and help text of each command. The function runs the
 #: command and returns its exit code. The arguments of the command are its arguments and
@@ -78,7 +78,6 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
 
 
 def _run(registries: Registries, argv: Sequence[str]) -> int:
-    registries = installed(registries)
     if argv[:1] == ["worker"]:  # a process of a run
         defer_parts_of_numpy()
         from mortarbench.processes import worker
