@@ -44,6 +44,7 @@ class Entry(NamedTuple):
     met: int  #: number of cases that the solver solved with the accuracy of the row
     cases: int  #: number of cases of the row
     growth: PowerLaw | None  #: time against m
+    tier: int = 0  #: 1 for the fastest solver; 0 for a solver that does not compete
     note: str = ""  #: reason for the absence of a time, such as "declined"
 
 
@@ -102,10 +103,10 @@ def rows(run: Measurements) -> Iterator[Row]:
                 good = of_form[of_form.verified & (of_form.tol == accuracy)]
             if by_error and good.solver.nunique() < 2 < of_form.solver.nunique():
                 continue  # no comparison: hardly a solver is so accurate
-            yield _row(run, of_form, good, form, accuracy, by_error=by_error)
+            yield row_of(run, of_form, good, form, accuracy, by_error=by_error)
 
 
-def _row(
+def row_of(
     run: Measurements,
     every: pd.DataFrame,
     good: pd.DataFrame,
@@ -114,6 +115,11 @@ def _row(
     *,
     by_error: bool,
 ) -> Row:
+    """Compare the solvers on the cases of one form at one accuracy.
+
+    every : all answers, one row per case, solver and tolerance
+    good : those with the accuracy, one row per case and solver
+    """
     cases, labels = every.case.nunique(), in_order(every.solver, run.solvers)
     timed = good[(good.total_seconds > 0) & ~good.remembered]
     logs = _logs(run.df, timed)
@@ -135,7 +141,7 @@ def _row(
             note = "reuses answers"
         met = int((good.solver == solver).sum())
         growth = growth_of(timed[timed.solver == solver])
-        entries.append(Entry(solver, time, met, cases, growth, note))
+        entries.append(Entry(solver, time, met, cases, growth, note=note))
     entries.sort(
         key=lambda e: (e.time is None, e.solver != first, e.time and e.time.ratio.value)
     )
@@ -143,9 +149,28 @@ def _row(
         form=form,
         accuracy=accuracy,
         by_error=by_error,
-        entries=tuple(entries),
+        entries=tuple(_in_tiers(entries, logs, means)),
         chosen=good,
     )
+
+
+def _in_tiers(
+    entries: Iterable[Entry], logs: Logs, means: pd.DataFrame
+) -> Iterator[Entry]:
+    """Yield the entries with their tiers; they are given from the fastest on.
+
+    A solver begins the next tier if the interval of its time relative to the first
+    solver of the tier is above 1, on the cases that both solved.
+    """
+    leader, tier = "", 0
+    for e in entries:
+        if e.time is None or e.met < COMPLETE * len(means):
+            yield e
+            continue
+        both = means.index[means[[leader or e.solver, e.solver]].notna().all(axis=1)]
+        if not leader or compared(logs, leader, e.solver, both).ratio.low > 1:
+            leader, tier = e.solver, tier + 1
+        yield e._replace(tier=tier)
 
 
 def _first_by_pairs(logs: Logs, means: pd.DataFrame, first: str) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 from mortarbench.harness.record import Record, Verdict
@@ -98,16 +99,14 @@ class Schedule:
         Each block is determined when it is requested, so that it takes all measurements
         before it into account.
         """
-        for group in self.suite.groups:
-            for tol in self.suite.tolerances:
-                for repeat in range(self.suite.repeats):
-                    block = self._block(group, tol, repeat)
-                    if block is not None:
-                        first = block.turns[0][0]
-                        self.progress.say(
-                            f"{first.case}, tol {tol:g}, repeat {repeat + 1}"
-                        )
-                        yield block
+        s = self.suite
+        for together in s.groups:
+            for tol, repeat, group in product(s.tolerances, range(s.repeats), together):
+                block = self._block(group, tol, repeat)
+                if block is not None:
+                    first = block.turns[0][0]
+                    self.progress.say(f"{first.case}, tol {tol:g}, repeat {repeat + 1}")
+                    yield block
 
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
         """Return a block with its remaining turns in random order; None if none remain.

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -103,25 +104,29 @@ class Suite:
     accuracy: float | None = None
 
     @property
-    def groups(self) -> tuple[Group, ...]:
+    def groups(self) -> tuple[tuple[Group, ...], ...]:
         """Groups of cases that form a block: single cases, followed by sequences.
 
         If the steps of a sequence are also measured cold, they form one cold block, so
-        that both ways differ only in the reuse of results.
+        that both ways differ only in the reuse of results. Their groups stand together,
+        because the blocks of each repeat follow each other.
         """
         cold = {case.name for case in self.cases}
         twice = [s for s in self.sequences if cold.issuperset(c.name for c in s)]
         steps = {case.name for sequence in twice for case in sequence}
         return (
-            *(Group((case,), "cold") for case in self.cases if case.name not in steps),
-            *(Group(steps, "cold") for steps in twice),
-            *(Group(steps, "sequence") for steps in self.sequences),
+            *((Group((c,), "cold"),) for c in self.cases if c.name not in steps),
+            *(
+                (*[Group(s, "cold")] * (s in twice), Group(s, "sequence"))
+                for s in self.sequences
+            ),
         )
 
     @property
     def names(self) -> tuple[CaseId, ...]:
         """All cases: single cases, then the steps of each sequence."""
-        return tuple(case for group in self.groups for case in group.cases)
+        groups = chain.from_iterable(self.groups)
+        return tuple(case for group in groups for case in group.cases)
 
 
 def load_suite(

@@ -263,6 +263,8 @@ def test_steps_listed_both_ways_are_solved_once_each_cold_and_warm(measure, tmp_
         assert [r.params["h"] for r in chain] == [0.5, 1.0, 1.5]
         assert [r.iterations for r in chain] == expected
         assert len({r.block for r in chain}) == 1
+    modes = {r.block: r.mode for r in records}  # both ways follow each other
+    assert [modes[k] for k in sorted(modes)] == ["cold", "sequence"] * 2
 
 
 def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_path):
