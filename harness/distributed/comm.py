@@ -35,7 +35,7 @@ PEER_TIMEOUT = 5.0  #: longest time for which a failed rank waits for the other 
 #: solvers.
 RECORD = "MORTARBENCH_RANK_RECORD"
 _ORDER = 7  #: MPI tag of the orders of rank 0
-_PART = 8  #: MPI tag of the parts of a sum
+_PART = 8  #: MPI tag of the parts of a sum or a vector
 #: time after the last order for which a rank waits without sleeping, s; products of one
 #: solve follow each other within this time
 _SPIN_SECONDS = 0.02
@@ -64,6 +64,9 @@ class Comm:
         sum in every run.
         """
         return part
+
+    def fill(self, v: NDArray[Any], parts: Sequence[slice]) -> None:
+        """Copy the parts of v, one of each rank, from their ranks to v on rank 0."""
 
     def gather(self, part: T) -> list[T]:
         """Return the values of all ranks on rank 0, an empty list elsewhere."""
@@ -129,6 +132,13 @@ class _MPIComm(Comm):
             self._comm.Recv(received, source=rank, tag=_PART)
             total += received
         return total
+
+    def fill(self, v: NDArray[Any], parts: Sequence[slice]) -> None:
+        if self.rank:
+            self._comm.Send(v[parts[self.rank]], dest=0, tag=_PART)
+            return
+        for rank in range(1, self.size):  # without pickled copies
+            self._comm.Recv(v[parts[rank]], source=rank, tag=_PART)
 
     def gather(self, part: T) -> list[T]:
         return self._comm.gather(part) or []

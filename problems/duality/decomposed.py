@@ -76,8 +76,8 @@ class DecomposedLinearisation:
 
     bodies: UnassembledBodies
     served: Served
-    primal: QP  #: supports and contact rows, with P = 0
-    rows: ContactRows  #: contact rows of `primal`, m
+    fixed: Nodes  #: components fixed by supports
+    rows: ContactRows  #: contact rows, m
     friction: Friction
     reference: ReferenceOfOperator
 
@@ -126,22 +126,15 @@ def decomposed_path(
         friction = friction_of(
             bodies, rows, stage.laws, at.slip_origin, at.normal_forces
         )
-        primal = QP(
-            P=csc_array((zero.size, zero.size)),
-            q=zero,
-            A=support_rows(bodies.mesh, stage.fixed),
-            b=np.zeros(stage.fixed.size),
-            G=rows.B,
-            h=rows.c / bodies.length,
-        )
-        contact = contact_of(primal, friction)
+        # the QP is not stored, because every rank would have a copy
+        contact = contact_of(_interface_qp(bodies, stage.fixed, rows), friction)
         parts = decompose(elastic, layout, choice.glue, stage, contact)
         if not first:
             first.append(TornBodies(parts, comm))
         # the bodies are unchanged, so reuse their classes of subdomains
         served = Served(first[0].with_problem(parts))
         return DecomposedLinearisation(
-            bodies, served, primal, rows, friction, reference
+            bodies, served, stage.fixed, rows, friction, reference
         )
 
     rest = State(zero, zero, np.full(places, problem.initial_force))
@@ -223,14 +216,27 @@ def interface_state(
     u : (n,) nondimensional displacement
     s : solution of the dual
     """
-    diagonal = np.zeros(u.size)
+    primal = _interface_qp(at.bodies, at.fixed, at.rows)
     if at.friction.bound.size:
-        components = np.unique(at.friction.T.indices)
+        diagonal, components = np.zeros(u.size), np.unique(at.friction.T.indices)
         diagonal[components] = dual.parts.diagonal(components)
-    primal = replace(at.primal, P=csc_array(diags_array(diagonal)))
+        primal = replace(primal, P=csc_array(diags_array(diagonal)))
     y, z = np.zeros(primal.b.size), dual.multipliers(s)
     whole = Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=np.zeros(u.size))
     return InterfaceState(at.bodies, primal, whole, at.rows, at.friction)
+
+
+def _interface_qp(bodies: UnassembledBodies, fixed: Nodes, rows: ContactRows) -> QP:
+    """Return the rows of supports and contact as a QP with P = 0."""
+    n = bodies.mesh.dofs
+    return QP(
+        P=csc_array((n, n)),
+        q=np.zeros(n),
+        A=support_rows(bodies.mesh, fixed),
+        b=np.zeros(fixed.size),
+        G=rows.B,
+        h=rows.c / bodies.length,
+    )
 
 
 def decompose(

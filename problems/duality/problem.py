@@ -53,7 +53,8 @@ class Shape:
 
     mesh: Mesh  #: joined mesh of all bodies, m
     body: NDArray[np.int64]  #: (E,) body of each cell
-    parts: tuple[Mesh, ...] = ()  #: mesh of each body; empty for unstructured meshes
+    #: grid of each body, without cells; empty for unstructured meshes
+    parts: tuple[Mesh, ...] = ()
 
     @property
     def dim(self) -> int:
@@ -83,7 +84,14 @@ class Shape:
 
 def structured(*parts: Mesh) -> Shape:
     """Return the shape of structured bodies with distinct names of all boundaries."""
-    return Shape(*join(parts), parts)
+    mesh, body = join(parts)
+    ends, no_cells = np.cumsum([len(part.points) for part in parts]), mesh.cells[:0]
+    # `layout` needs no cells of the parts, which would take memory on every rank
+    grids = [
+        Mesh(points, no_cells, {}, part.divisions)
+        for points, part in zip(np.split(mesh.points, ends[:-1]), parts, strict=True)
+    ]
+    return Shape(mesh, body, tuple(grids))
 
 
 #: fields that `ElasticBodies` and `UnassembledBodies` have in common

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -230,17 +231,9 @@ class Subdomains:
 
     def combined(self, v: NDArray[Any]) -> NDArray[Any]:
         """Complete a torn vector (N,) with the subdomains of the other ranks."""
-        for rank, part in enumerate(
-            self.comm.gather(v[self._unknowns(self.comm.rank)])
-        ):
-            if rank:  # the part of rank 0 is in place
-                v[self._unknowns(rank)] = part
+        first = np.searchsorted(self.rank, np.arange(self.comm.size + 1))
+        self.comm.fill(v, [slice(*ends) for ends in pairwise(self.start[first])])
         return v
-
-    def _unknowns(self, rank: int) -> slice:
-        """Return the torn unknowns of the subdomains of a rank."""
-        first, end = np.searchsorted(self.rank, [rank, rank + 1])
-        return slice(self.start[first], self.start[end])
 
     def inverse(self, b: Vector) -> Vector:
         """Apply K⁺ to a torn vector (N,)."""

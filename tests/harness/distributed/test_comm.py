@@ -31,6 +31,9 @@ class Numbers:
 def test_sums_and_lists_arrive_on_rank_0_and_broadcasts_everywhere(size):
     def work(comm):
         part = np.full(4, comm.rank + 1.0)
+        whole = np.where(np.arange(size) == comm.rank, comm.rank + 1.0, 0.0)
+        comm.fill(whole, [slice(rank, rank + 1) for rank in range(size)])
+        assert comm.rank or whole.tolist() == list(range(1, size + 1))
         return (
             comm.sum(part),
             comm.gather(comm.rank),
