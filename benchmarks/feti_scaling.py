@@ -43,7 +43,7 @@ from sksparse.cholmod import cholesky
 from mortarbench.harness import Mechanics, certify, no_rows
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
-from mortarbench.problems.duality.decomposed import decompose
+from mortarbench.problems.duality.decomposed import decompose, subdivided
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.duality.feti_dual import TornDual, feti_dual
 from mortarbench.problems.duality.monolithic import primal_qp
@@ -95,7 +95,7 @@ def one(way, family, size, cells):
     served = subdomains = None
     if way == "feti":
         contact = Contact(csr_array(primal.G), primal.h, np.zeros(0))
-        layout = of.shape.layout(cells)
+        layout = subdivided(of.shape, cells)
         parts = decompose(of, layout, "orthonormal", stage, contact)
         served = Served(TornBodies(parts))
         subdomains = torn_mechanics(served, primal.P)

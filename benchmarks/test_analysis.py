@@ -17,7 +17,7 @@ from sksparse.cholmod import cholesky
 
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_facet import node_to_facet
-from mortarbench.problems.contact.stepping import forces_of, load_steps
+from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import load_path, recovered
 from mortarbench.problems.families.beam_ring import model
@@ -61,7 +61,7 @@ def analysis(form, Nr=30, Nh=15, steps=10):
         assert s.status == "solved"
         return s
 
-    stages = load_steps(steps, 1, forces_of(bodies.f), bodies.B_D.indices)
+    stages = load_steps(steps, 1, bodies.f, bodies.fixed)
     path = load_path(
         bodies, stages, lambda _: linearise, lambda _: inverse, solve, transform
     )
@@ -72,7 +72,7 @@ def analysis(form, Nr=30, Nh=15, steps=10):
 
 def plain(bodies):
     """Return a function that orders and factorises K without fixed components."""
-    free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
+    free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.fixed)
     K_ff = csc_matrix(bodies.K[free][:, free])
     return lambda: cholesky(K_ff, mode="simplicial", ordering_method="amd")
 

@@ -24,6 +24,7 @@ For example, one steel block is pressed onto another::
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -34,6 +35,7 @@ from mortarbench.problems.contact.balance import check_balance
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
+    Shape,
     assemble,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
@@ -43,7 +45,6 @@ from mortarbench.problems.duality.case_forms import FORMS, case_of
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
-    elastic_bodies_of,
     keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material
@@ -128,17 +129,18 @@ def one_step(
         )
     law = FrictionLaw() if friction is None else _check_law(friction, reference)
     laws = (law,) * len(bodies.pairs)
-    elastic = elastic_bodies_of(bodies)
+    # without grids, `parts` is the number of subdomains for structured bodies as well
+    bodies = replace(bodies, shape=Shape(bodies.mesh, bodies.body))
     rows = linearisation(bodies, contact, basis, laws)(np.zeros(bodies.mesh.dofs))
     # the friction force of a tangential row can act in both directions
     check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
     problem = ContactProblem(
-        bodies=elastic,
+        bodies=bodies,
         linearise=keyed_linearisation(contact, basis),
-        stages=load_steps(1, 1, elastic.forces, elastic.fixed, laws),
+        stages=load_steps(1, 1, bodies.f, bodies.fixed, laws),
         # the first friction bound of Coulomb's law must be large enough for friction to
         # support bodies that nothing else supports
-        initial_force=float(np.abs(elastic.forces.value).sum()),
+        initial_force=float(np.abs(bodies.f).sum()),
     )
     choice = Choice(size=parts, glue=glue)
     return case_of(problem, form, choice, reference or _no_reference)

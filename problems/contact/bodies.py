@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ from mortarbench.problems.fem.mesh import (
     Nodes,
     dofs_of,
     facet_quadrature,
+    join,
 )
 
 #: rigid motions along which springs resist less than this fraction of the largest
@@ -75,6 +77,28 @@ def slave_places(pairs: Sequence[ContactPair]) -> int:
     return sum(pair.slave_nodes.size for pair in pairs)
 
 
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Geometry of bodies."""
+
+    mesh: Mesh  #: joined mesh of all bodies, m
+    body: NDArray[np.int64]  #: (E,) body of each cell
+    #: grid of each body, without cells; empty for unstructured meshes
+    grids: tuple[Mesh, ...] = ()
+
+
+def structured(*parts: Mesh) -> Shape:
+    """Return the shape of structured bodies with distinct names of all boundaries."""
+    mesh, body = join(parts)
+    ends, no_cells = np.cumsum([len(part.points) for part in parts]), mesh.cells[:0]
+    # subdivision needs no cells of the grids, which would take memory on every rank
+    grids = [
+        Mesh(points, no_cells, {}, part.divisions)
+        for points, part in zip(np.split(mesh.points, ends[:-1]), parts, strict=True)
+    ]
+    return Shape(mesh, body, tuple(grids))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UnassembledBodies:
     """Bodies without stiffness matrix: mesh, materials, supports, load, contact sides.
@@ -89,16 +113,14 @@ class UnassembledBodies:
 
     """
 
-    mesh: Mesh  #: joined mesh of all bodies, m
-    body: NDArray[np.int64]  #: (E,) body of each cell
+    shape: Shape
     names: tuple[str, ...]
-    materials: tuple[Material, ...]
+    materials: tuple[Material, ...]  #: material of each body
     plane: Plane | None  #: plane state; None in 3D
     length: float  #: l, unit of length, m
     force: float  #: F₀, unit of force: N/m in 2D, N in 3D
     f: Vector  #: (n,) full load of eq. (1), non-dimensional
-    #: (m_E, n) support rows of eq. (5), one unit entry per prescribed component
-    B_D: csr_array
+    fixed: Nodes  #: (m_E,) prescribed components
     pairs: tuple[ContactPair, ...]  #: sides that may touch
     #: (bodies,) piece of each body; bodies of a piece have common nodes, and move
     #: rigidly together. None: every body is a piece
@@ -113,6 +135,33 @@ class UnassembledBodies:
     def __post_init__(self) -> None:
         if (np.diff(self.piece_of_node) < 0).any():
             raise ValueError("nodes must be numbered in the order of their bodies")
+
+    @property
+    def mesh(self) -> Mesh:
+        """Joined mesh of all bodies, m."""
+        return self.shape.mesh
+
+    @property
+    def body(self) -> NDArray[np.int64]:
+        """Body of each cell, (E,)."""
+        return self.shape.body
+
+    @cached_property
+    def B_D(self) -> csr_array:
+        """Support rows (m_E, n) of eq. (5), with one unit entry each."""
+        return csr_array(eye_array(self.mesh.dofs, format="csr")[self.fixed])
+
+    @cached_property
+    def assembled(self) -> Bodies:
+        """The bodies with their stiffness matrix."""
+        return self if isinstance(self, Bodies) else assemble_stiffness(self)
+
+    @cached_property
+    def is_supported(self) -> bool:
+        """True if supports and springs exclude all rigid motions of every piece."""
+        rigid = self.rigid
+        fixed = rigid[self.fixed]
+        return not rigid.size or bool(np.linalg.matrix_rank(fixed) == rigid.shape[1])
 
     @property
     def body_of_node(self) -> NDArray[np.int64]:
@@ -196,6 +245,21 @@ class Bodies(UnassembledBodies):
 
     K: csc_array  #: (n, n) stiffness matrix of eq. (1)
 
+    @cached_property
+    def clamped(self) -> GeneralisedInverse:
+        """K⁺ with zeros at fixed components, see `factorise_clamped`."""
+        return factorise_clamped(self)
+
+    @cached_property
+    def supported(self) -> GeneralisedInverse:
+        """K⁺ like `clamped`, but also for bodies supported by contact alone."""
+        return factorise_supported(self)
+
+    @cached_property
+    def floating(self) -> GeneralisedInverse:
+        """K⁺ of the floating bodies, with the kernel R of all rigid motions."""
+        return factorise_floating(self)
+
 
 def assemble(
     mesh: Mesh,
@@ -223,25 +287,17 @@ def assemble(
     length, force = units
     return assemble_stiffness(
         UnassembledBodies(
-            mesh=mesh,
-            body=body,
+            shape=Shape(mesh, body),
             names=names,
             materials=materials,
             plane=plane,
             length=length,
             force=force,
             f=load / force,
-            B_D=support_rows(mesh, fixed),
+            fixed=fixed,
             pairs=pairs,
         )
     )
-
-
-def is_supported(bodies: UnassembledBodies) -> bool:
-    """Return True if supports and springs exclude all rigid motions of every piece."""
-    rigid = bodies.rigid
-    fixed = rigid[bodies.B_D.indices]
-    return not rigid.size or bool(np.linalg.matrix_rank(fixed) == rigid.shape[1])
 
 
 def joined_names(names: tuple[str, ...], piece: NDArray[np.int64]) -> tuple[str, ...]:
@@ -275,11 +331,6 @@ def spring_rows(
     return csr_array((values.ravel(), tuple(at)), shape=(row.size, points.size))
 
 
-def support_rows(mesh: Mesh, fixed: Nodes) -> csr_array:
-    """Return B_D (m_E, n), the rows of prescribed components."""
-    return csr_array(eye_array(mesh.dofs, format="csr")[fixed])
-
-
 def assemble_stiffness(bodies: UnassembledBodies) -> Bodies:
     """Return the bodies with their stiffness matrix assembled."""
     data = {part.name: getattr(bodies, part.name) for part in fields(bodies)}
@@ -300,7 +351,7 @@ def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedI
     """
     parts, kernels = bodies.points_of_pieces, bodies.kernels
     fixing = [dofs_of(fixing_nodes(part), bodies.mesh.dim) for part in parts]
-    constrained = np.union1d(bodies.interface, bodies.B_D.indices)
+    constrained = np.union1d(bodies.interface, bodies.fixed)
     interface = Interface(constrained, bodies.mesh.points) if condense else None
     return floating_inverse(bodies.K, kernels, fixing, interface)
 
@@ -314,15 +365,14 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
         If the supports allow a rigid motion of some body.
 
     """
-    prescribed = bodies.B_D.indices
     # a factorisation can fail to detect a singular K, since rounding may make it
     # nonsingular
-    if not is_supported(bodies):
+    if not bodies.is_supported:
         raise InputError(
             "the supports allow a rigid motion of some body, so dual-bounds does not "
             "exist; expected form primal or dual"
         )
-    free = np.setdiff1d(np.arange(bodies.mesh.dofs), prescribed)
+    free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.fixed)
     interface = Interface(bodies.interface, bodies.mesh.points)
     return regular_inverse(bodies.K, free, interface)
 
@@ -333,7 +383,7 @@ def factorise_supported(bodies: Bodies) -> GeneralisedInverse:
     Where the supports allow rigid motions, further components are fixed; see
     `problems.fem.inverse.supported_inverse`.
     """
-    free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
+    free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.fixed)
     interface = Interface(bodies.interface, bodies.mesh.points)
     return supported_inverse(bodies.K, free, bodies.rigid, interface)
 

@@ -30,19 +30,6 @@ from mortarbench.problems.contact.friction import (
 from mortarbench.problems.fem.mesh import Nodes
 
 
-class Forces(NamedTuple):
-    """Non-dimensional nodal forces at listed components; zero at all others."""
-
-    component: Nodes  #: (k,) distinct components
-    value: Vector  #: (k,) force at each component
-
-    def on(self, n: int) -> Vector:
-        """Return the forces at all components, (n,)."""
-        f = np.zeros(n)
-        f[self.component] = self.value
-        return f
-
-
 class State(NamedTuple):
     """Initial state of a stage, with w displacement components."""
 
@@ -85,8 +72,8 @@ class Stage:
     """One linearisation of a load step."""
 
     step: int  #: number of the load step, 1, 2, …
-    part: float  #: load factor: the fraction of `forces` that acts
-    forces: Forces  #: full load
+    part: float  #: load factor: the fraction of `load` that acts
+    load: Vector  #: (n,) full load, nondimensional
     fixed: Nodes  #: components fixed by supports
     laws: tuple[FrictionLaw, ...] = ()  #: law of each pair; empty without friction
     #: map from the final state of the preceding stage to the initial state of this one
@@ -96,7 +83,7 @@ class Stage:
 def load_steps(
     steps: int,
     relin: int,
-    forces: Forces,
+    load: Vector,
     fixed: Nodes,
     laws: tuple[FrictionLaw, ...] = (),
     *,
@@ -111,7 +98,7 @@ def load_steps(
         Stage(
             step=k,
             part=k / steps,
-            forces=forces,
+            load=load,
             fixed=fixed,
             laws=laws,
             # relinearisations of a step keep its slip origin
@@ -232,9 +219,3 @@ def _fixed_point(linearised: P, stage: Stage) -> list[Iterate[P]]:
         Iterate(linearised, friction, constant(s))
         for friction, s in zip(frictions, solutions, strict=True)
     ]
-
-
-def forces_of(f: Vector) -> Forces:
-    """Return the nonzero components of a load (n,)."""
-    component = np.flatnonzero(f)
-    return Forces(component, f[component])

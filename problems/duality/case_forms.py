@@ -44,9 +44,6 @@ from mortarbench.problems.fem.inverse import GeneralisedInverse
 FORMS = ("primal", "dual", "dual-bounds")
 
 
-Factorise = Callable[[], GeneralisedInverse]
-
-
 def case_of(
     problem: ContactProblem, form: str, choice: Choice, reference: Reference
 ) -> Case:
@@ -54,7 +51,6 @@ def case_of(
 
     form : one of FORMS
     """
-    elastic = problem.bodies
     path, torn = monolithic_path(problem, reference), None
     chosen = path.problem(choice.step)
     whole, friction, _ = chosen
@@ -63,7 +59,7 @@ def case_of(
         from mortarbench.problems.duality.torn_form import torn_form
 
         torn = torn_form(problem, path, choice, chosen)
-    bodies = elastic.assembled
+    bodies = problem.bodies.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
         state = InterfaceState(bodies, primal, s, whole.rows, friction)
@@ -76,9 +72,6 @@ def case_of(
         whole.rows,
         form,
         torn=torn,
-        floating=lambda: elastic.floating,
-        clamped=lambda: elastic.clamped,
-        supported=lambda: elastic.supported,
         quantities=results,
         friction=friction,
         settle=lambda s: least_motion(bodies.rigid, primal, s, friction),
@@ -109,9 +102,7 @@ def contact_case(
     form: str,
     *,
     settle: Callable[[Solution], Solution] = lambda s: s,
-    floating: Factorise,
-    clamped: Factorise,
-    supported: Factorise,
+    floating: Callable[[Bodies], GeneralisedInverse] = lambda bodies: bodies.floating,
     quantities: Callable[[Solution], Mapping[str, Any]],
     friction: Friction = NO_FRICTION,
     torn: TornForm | None = None,
@@ -123,12 +114,8 @@ def contact_case(
     rows : contact rows of `primal`
     settle : function that selects one of the solutions with equal forces, for all
         results except certificates
-    floating : function that factorises K and returns K⁺ with the rigid modes as kernel;
-        called only for the form `dual`
-    clamped : function that returns K⁺ with the fixed components eliminated; called only
-        for the form `dual-bounds`
-    supported : function like `clamped`, but also for bodies that are supported by
-        contact alone; called to certify a solution
+    floating : function that returns K⁺ for the form `dual`, with the rigid motions as
+        kernel
     quantities : function that evaluates physical results from a solution of the primal
         problem; z of this solution lists the multipliers of the contact rows, then
         those of the friction rows
@@ -146,7 +133,7 @@ def contact_case(
     elif form == "primal":
         transformed = primal_form(primal, friction)
     else:
-        inverse = floating() if form == "dual" else clamped()
+        inverse = floating(bodies) if form == "dual" else bodies.clamped
         start = perf_counter()
         transform = dualise if form == "dual" else dual_bounds
         transformed = transform(primal, inverse, friction=friction)
@@ -185,7 +172,7 @@ def contact_case(
         mechanics=Mechanics(
             primal=primal,
             to_primal=to_primal,
-            factorise=supported,
+            factorise=lambda: bodies.supported,
             rigid=bodies.rigid,
             names=bodies.piece_names,
             scale=energy,

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 
 from mortarbench.harness import (
     QP,
@@ -29,11 +29,11 @@ from mortarbench.harness import (
 from mortarbench.harness.distributed.comm import Comm, led
 from mortarbench.harness.mechanics import boundary_facets, contact_rows
 from mortarbench.problems.contact.bodies import (
+    Shape,
     UnassembledBodies,
     elasticity_matrices,
     joined_names,
     slave_places,
-    support_rows,
 )
 from mortarbench.problems.contact.friction import friction_of
 from mortarbench.problems.contact.results import quantities
@@ -48,7 +48,6 @@ from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
     ContactSolution,
-    ElasticBodies,
     InterfaceState,
 )
 from mortarbench.problems.fem.elasticity import rigid_modes, stiffness
@@ -56,7 +55,9 @@ from mortarbench.problems.fem.fixing import fixing_nodes
 from mortarbench.problems.fem.mesh import Mesh, Nodes, as_vectors, dofs_of
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.mechanics import torn_mechanics
+from mortarbench.problems.feti.partition import graph_partition
 from mortarbench.problems.feti.served import Served
+from mortarbench.problems.feti.structured import blocks_of_meshes
 from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
@@ -116,9 +117,9 @@ def decomposed_path(
 
     All ranks must call this function, and the methods of the path, together.
     """
-    layout, elastic = cached_layout(problem.bodies, choice.size), problem.bodies
-    bodies, first = elastic.whole, list[TornBodies]()
-    zero, places = np.zeros(bodies.mesh.dofs), slave_places(elastic.pairs)
+    bodies, first = problem.bodies, list[TornBodies]()
+    layout = subdivided(bodies.shape, choice.size)
+    zero, places = np.zeros(bodies.mesh.dofs), slave_places(bodies.pairs)
 
     def pose(stage: Stage, at: State) -> DecomposedLinearisation:
         rows = problem.linearise(bodies, stage.laws)(at.u * bodies.length)
@@ -128,7 +129,7 @@ def decomposed_path(
         )
         # the QP is not stored, because every rank would have a copy
         contact = contact_of(_interface_qp(bodies, stage.fixed, rows), friction)
-        parts = decompose(elastic, layout, choice.glue, stage, contact)
+        parts = decompose(bodies, layout, choice.glue, stage, contact)
         if not first:
             first.append(TornBodies(parts, comm))
         # the bodies are unchanged, so reuse their classes of subdomains
@@ -148,9 +149,17 @@ def contact_of(primal: QP, friction: Friction) -> Contact:
 
 
 @lru_cache(maxsize=4)
-def cached_layout(bodies: ElasticBodies, size: int) -> Subdivision:
-    """Return the (cached) subdivision of bodies, see `Shape.layout`."""
-    return bodies.shape.layout(size)
+def subdivided(shape: Shape, size: int) -> Subdivision:
+    """Cut bodies into subdomains; the result is cached.
+
+    size : largest number of cells along a side of a subdomain; for unstructured meshes,
+        which METIS cuts, the number of subdomains
+    """
+    mesh, body = shape.mesh, shape.body
+    if shape.grids:
+        return blocks_of_meshes(shape.grids, size, (mesh, body))
+    label = graph_partition(mesh.points, mesh.cells, body, size)
+    return Subdivision(mesh, label, body)
 
 
 def case_on_ranks(
@@ -232,7 +241,7 @@ def _interface_qp(bodies: UnassembledBodies, fixed: Nodes, rows: ContactRows) ->
     return QP(
         P=csc_array((n, n)),
         q=np.zeros(n),
-        A=support_rows(bodies.mesh, fixed),
+        A=csr_array(eye_array(n, format="csr")[fixed]),
         b=np.zeros(fixed.size),
         G=rows.B,
         h=rows.c / bodies.length,
@@ -240,7 +249,7 @@ def _interface_qp(bodies: UnassembledBodies, fixed: Nodes, rows: ContactRows) ->
 
 
 def decompose(
-    bodies: ElasticBodies,
+    bodies: UnassembledBodies,
     layout: Subdivision,
     glue: str,
     stage: Stage,
@@ -266,7 +275,7 @@ def decompose(
     lift = None if bodies.lift is None else bodies.lift * stage.part
     return DecomposedProblem(
         layout=layout,
-        components=bodies.shape.dim,
+        components=bodies.mesh.dim,
         material=layout.body,
         assemble_class=partial(elastic_class, D=D, E=E),
         E=E,
@@ -274,7 +283,7 @@ def decompose(
         piece=pieces,
         shaping=None if layout.shaping is None else layout.shaping(share),
         fixed=stage.fixed,
-        load=stage.forces.on(n) * stage.part,
+        load=stage.load * stage.part,
         lift=lift,
         glue=glue,
         contact=_without_supports(
@@ -338,7 +347,7 @@ def elastic_class(
 STRESS_LAYERS = 3
 
 
-def largest_stresses(torn: TornBodies, elastic: ElasticBodies, u: Vector) -> Vector:
+def largest_stresses(torn: TornBodies, elastic: UnassembledBodies, u: Vector) -> Vector:
     """Return the largest nodal von Mises stress of each body on this rank, Pa.
 
     u : (n,) nondimensional displacement

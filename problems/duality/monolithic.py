@@ -19,9 +19,7 @@ from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.contact.balance import check_friction
 from mortarbench.problems.contact.bodies import (
     Bodies,
-    factorise_supported,
     slave_places,
-    support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, friction_of
 from mortarbench.problems.contact.rows import ContactRows, without_fixed
@@ -105,14 +103,12 @@ def monolithic_path(problem: ContactProblem, reference: Reference) -> Monolithic
     Only the contact rows are dualised. In 3D, the dense matrix of the dual could have
     several times as many rows if the support rows were included.
     """
-    elastic, bodies = problem.bodies, problem.bodies.assembled
+    bodies = problem.bodies.assembled
 
     def factorise(fixed: Nodes) -> GeneralisedInverse:
-        if fixed is elastic.fixed:
-            return elastic.clamped if elastic.is_supported else elastic.supported
-        return factorise_supported(
-            replace(bodies, B_D=support_rows(bodies.mesh, fixed))
-        )
+        if fixed is bodies.fixed:
+            return bodies.clamped if bodies.is_supported else bodies.supported
+        return replace(bodies, fixed=fixed).supported
 
     return load_path(
         bodies,
@@ -157,16 +153,15 @@ def load_path(
         return inverses[id(stage.fixed)]
 
     def bodies_of(stage: Stage) -> Bodies:
-        names = id(stage.forces), id(stage.fixed)
+        names = id(stage.load), id(stage.fixed)
         if names not in bodies_by_stage:
-            f = stage.forces.on(bodies.mesh.dofs)
-            supports = support_rows(bodies.mesh, stage.fixed)
-            bodies_by_stage[names] = replace(bodies, f=f, B_D=supports)
+            of_stage = replace(bodies, f=stage.load, fixed=stage.fixed)
+            bodies_by_stage[names] = of_stage
         return bodies_by_stage[names]
 
     def pose(stage: Stage, at: State) -> MonolithicLinearisation:
         rows = without_fixed(linearise(stage.laws)(at.u * bodies.length), stage.fixed)
-        loaded, load = bodies_of(stage), (id(stage.forces), id(stage.fixed))
+        loaded, load = bodies_of(stage), (id(stage.load), id(stage.fixed))
         primal = primal_qp(loaded, rows, stage.part)
         first = friction_of(loaded, rows, stage.laws, at.slip_origin, at.normal_forces)
         if first.bound.size and not any(law.mu for law in stage.laws):

@@ -72,8 +72,6 @@ from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.contact.bodies import (
     Bodies,
-    factorise_clamped,
-    is_supported,
     slave_places,
 )
 from mortarbench.problems.contact.rows import ContactRows, without_fixed
@@ -364,7 +362,7 @@ class NewtonPath:
         self, u: Vector, load_factor: float, gaps: Gaps
     ) -> Configuration:
         rows = gaps.linearise(u * self.bodies.length)
-        rows = without_fixed(rows, self.bodies.B_D.indices)
+        rows = without_fixed(rows, self.bodies.fixed)
         gap = rows.c / self.bodies.length - rows.B @ u
         cells, f = evaluate(self.cells, u), load_factor * self.bodies.f
         return Configuration(
@@ -398,7 +396,7 @@ class NewtonPath:
     def _free_norm(self, force: Vector) -> float:
         """Return the Euclidean norm of a force (n,) on the unsupported components."""
         free = np.ones(force.size, dtype=bool)
-        free[self.bodies.B_D.indices] = False
+        free[self.bodies.fixed] = False
         return float(np.linalg.norm(force[free]))
 
     def _rounding(self, at: Configuration, lam: Vector, iteration: Iteration) -> float:
@@ -488,16 +486,8 @@ class NewtonPath:
 
     def _inverse(self, K: csc_array) -> GeneralisedInverse:
         tangent = replace(self.bodies, K=K)
-        return (
-            factorise_clamped(tangent)
-            if self._is_supported
-            else sliding_inverse(tangent)
-        )
-
-    @cached_property
-    def _is_supported(self) -> bool:
-        """True if the supports exclude all rigid motions."""
-        return is_supported(self.bodies)
+        is_supported = self.bodies.is_supported
+        return tangent.clamped if is_supported else sliding_inverse(tangent)
 
     @cached_property
     def _kernel_defect(self) -> str:
@@ -506,7 +496,7 @@ class NewtonPath:
             free_translations(self.bodies)
         except InputError as e:
             return str(e)
-        if self.gaps.curvature is not None and not self._is_supported:
+        if self.gaps.curvature is not None and not self.bodies.is_supported:
             return (
                 "contact_stiffness=geometric is not built for bodies supported by "
                 "contact alone, because their translations change the contact forces; "
@@ -515,7 +505,7 @@ class NewtonPath:
         return ""
 
     def _solve(self, primal: QP, inverse: GeneralisedInverse) -> Solution:
-        transform = dual_bounds if self._is_supported else dualise
+        transform = dual_bounds if self.bodies.is_supported else dualise
         new = transform(primal, inverse)
         if not new.qp.q.size:
             none = np.zeros(0)
@@ -592,7 +582,7 @@ def free_translations(bodies: Bodies) -> list[NDArray[np.float64]]:
     """
     owner, bases = bodies.body_of_node, []
     fixed = np.zeros(bodies.mesh.dofs, dtype=bool)
-    fixed[bodies.B_D.indices] = True
+    fixed[bodies.fixed] = True
     rigid = bodies.rigid
     for b, name in enumerate(bodies.names):
         dofs = dofs_of(np.flatnonzero(owner == b), bodies.mesh.dim)
@@ -617,5 +607,5 @@ def sliding_inverse(tangent: Bodies) -> GeneralisedInverse:
         dofs_of(fixing_nodes(points[owner == b]), dim) if R.shape[1] else none
         for b, R in enumerate(kernels)
     ]
-    touched = np.union1d(tangent.interface, tangent.B_D.indices)
+    touched = np.union1d(tangent.interface, tangent.fixed)
     return floating_inverse(tangent.K, kernels, fixing, Interface(touched, points))

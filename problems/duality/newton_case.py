@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from mortarbench.harness import Case, Fields, Reference, Solution, Vector
-from mortarbench.problems.contact.bodies import (
-    Bodies,
-    factorise_clamped,
-    factorise_supported,
-)
+from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.linearise import (
     closest_segments,
     contact_stiffness,
@@ -134,9 +130,7 @@ def newton_case(
         primal,
         at.rows,
         form,
-        floating=lambda: sliding_inverse(bodies),
-        clamped=lambda: factorise_clamped(bodies),
-        supported=lambda: factorise_supported(bodies),
+        floating=sliding_inverse,
         quantities=collected,
     )
     assert case.mechanics is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from time import perf_counter
 
 from mortarbench.problems.contact.stepping import Iterate
-from mortarbench.problems.duality.decomposed import cached_layout, contact_of, decompose
+from mortarbench.problems.duality.decomposed import contact_of, decompose, subdivided
 from mortarbench.problems.duality.dualisation import TornForm
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
@@ -61,7 +61,7 @@ def _torn(
     """
     elastic = problem.bodies
     contact = contact_of(linearised.problem.primal, linearised.friction)
-    layout = cached_layout(elastic, choice.size)
+    layout = subdivided(elastic.shape, choice.size)
     of_stage = problem.stages[stage]
     parts = decompose(elastic, layout, choice.glue, of_stage, contact)
     return Served(TornBodies(parts))

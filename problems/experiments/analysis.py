@@ -18,7 +18,7 @@ from mortarbench.problems.contact.bodies import Bodies, factorise_floating
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import fields
 from mortarbench.problems.contact.rows import ContactRows
-from mortarbench.problems.contact.stepping import forces_of, load_steps
+from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.duality.monolithic import load_path, recovered
 from mortarbench.problems.experiments.clock import Laps, Stopwatch, race
@@ -80,7 +80,7 @@ def analyse(
         duals.append(qp)
         return solution
 
-    stages = load_steps(steps, 1, forces_of(bodies.f), bodies.B_D.indices)
+    stages = load_steps(steps, 1, bodies.f, bodies.fixed)
     path = load_path(
         bodies, stages, lambda _: linearise, lambda _: inverse, solve_dual, dualise
     )

@@ -27,20 +27,23 @@ import numpy as np
 
 from mortarbench.harness import InputError, Solution, Vector
 from mortarbench.harness.keys import DERIVED, Range
-from mortarbench.problems.contact.bodies import Bodies, ContactPair
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    UnassembledBodies,
+    structured,
+)
 from mortarbench.problems.contact.friction import law_of
-from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.problem import (
     ContactProblem,
-    ElasticBodies,
-    Shape,
     keyed_linearisation,
-    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
+    Mesh,
     Nodes,
     as_vectors,
     dofs_of,
@@ -135,28 +138,28 @@ class BeamRing(ContactFamily):
         else:
             refuse_unused(self, "sides", "depth=0", "depth=1 or more")
 
-    def bodies(self) -> ElasticBodies:
+    def bodies(self) -> UnassembledBodies:
         """Return the beam and the ring, loaded by F₀."""
         return bodies(self.Nr, self.Nh, self.radial, self.plane, self.depth, self.sides)
 
     def problem(self) -> ContactProblem:
         """Return the benchmark, loaded in `steps` equal load steps."""
         elastic = self.bodies()
-        tip, share = _tip(elastic.shape)
+        tip, share = _tip(elastic.mesh)
         return ContactProblem(
             bodies=elastic,
             linearise=keyed_linearisation(self.contact, self.basis),
             stages=load_steps(
                 self.steps,
                 self.relin,
-                elastic.forces,
+                elastic.f,
                 elastic.fixed,
                 (law_of(self.friction, self.bound, self.mu),),
                 quasi_static=self.loading == "quasi-static",
             ),
             results=lambda answer: {
                 "tip": (
-                    share @ as_vectors(answer.at(tip), elastic.shape.dim) * LENGTH
+                    share @ as_vectors(answer.at(tip), elastic.mesh.dim) * LENGTH
                 ).tolist()
             },
         )
@@ -169,14 +172,14 @@ class BeamRing(ContactFamily):
         self, path: NewtonPath, at: Iteration, s: Solution
     ) -> Mapping[str, Any]:
         """Return the displacement of the loaded corner, m."""
-        tip, _ = _tip(self.bodies().shape)
+        tip, _ = _tip(self.bodies().mesh)
         return {"tip": (s.x[tip] * LENGTH).tolist()}
 
 
 @lru_cache(maxsize=4)
 def bodies(
     Nr: int, Nh: int, radial: int, plane: Plane, depth: int = 0, sides: str = "free"
-) -> ElasticBodies:
+) -> UnassembledBodies:
     """Return a beam of 8Nr × Nr cells above a ring of 12Nh × radial cells.
 
     depth : number of layers across the thickness; 0 for plane bodies
@@ -189,18 +192,19 @@ def bodies(
     if depth:
         parts = [extruded(part, depth, THICKNESS) for part in parts]
     shape = structured(*parts)
-    by_name = shape.sides
+    mesh, by_name = shape.mesh, shape.mesh.boundaries
     # in 2D, these are m_E = 2(Nr + 1) + 4(radial + 1) components
     clamped = [
-        dofs_of(nodes_of_side(by_name[b]), shape.dim)
+        dofs_of(nodes_of_side(by_name[b]), mesh.dim)
         for b in ("left", "left_foot", "right_foot")
     ]
     if sides == "plane-strain":
-        ends = np.isin(shape.mesh.points[:, 2], (0.0, THICKNESS))
+        ends = np.isin(mesh.points[:, 2], (0.0, THICKNESS))
         clamped.append(dofs_of(np.flatnonzero(ends), 3, 2))
     fixed = np.concatenate(clamped)
-    tip, share = _tip(shape)
-    return ElasticBodies(
+    f, (tip, share) = np.zeros(mesh.dofs), _tip(mesh)
+    f[tip[1 :: mesh.dim]] = -share
+    return UnassembledBodies(
         shape=shape,
         names=NAMES,
         materials=(BEAM, RING),
@@ -208,7 +212,7 @@ def bodies(
         length=LENGTH,
         force=LOAD,
         fixed=np.unique(fixed) if depth else fixed,
-        forces=Forces(tip[1 :: shape.dim], -share),
+        f=f,
         # as in the paper: the ring is the slave, the beam the master
         pairs=(ContactPair(slave=by_name["outer"], master=by_name["bottom"]),),
     )
@@ -219,7 +223,7 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
     return bodies(Nr, Nh, radial, plane).assembled
 
 
-def _tip(shape: Shape) -> tuple[Nodes, Vector]:
+def _tip(mesh: Mesh) -> tuple[Nodes, Vector]:
     """Return the components of the loaded corner, at the upper right of the beam.
 
     Returns
@@ -228,9 +232,9 @@ def _tip(shape: Shape) -> tuple[Nodes, Vector]:
     fraction (k,) of the load that acts on each node
 
     """
-    sides = shape.sides
+    sides = mesh.boundaries
     nodes = np.intersect1d(sides["top"], sides["right"])
     share = np.ones(1)
-    if shape.dim == 3:
-        share = nodal_lengths(shape.mesh.points[nodes]) / THICKNESS
-    return dofs_of(nodes, shape.dim), share
+    if mesh.dim == 3:
+        share = nodal_lengths(mesh.points[nodes]) / THICKNESS
+    return dofs_of(nodes, mesh.dim), share

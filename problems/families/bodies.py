@@ -22,15 +22,13 @@ from mortarbench.harness.files.datafile import content_digest
 from mortarbench.harness.keys import DERIVED, Range, keys_of
 from mortarbench.harness.mechanics import boundary_facets, cell_blocks
 from mortarbench.problems.contact.balance import check_balance, is_determined
-from mortarbench.problems.contact.bodies import Bodies
+from mortarbench.problems.contact.bodies import Bodies, UnassembledBodies
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.rows import ContactRows, without_fixed
 from mortarbench.problems.contact.sides import pair_names
 from mortarbench.problems.contact.stepping import load_steps, with_normal_forces
 from mortarbench.problems.duality.problem import (
     ContactProblem,
-    ElasticBodies,
-    elastic_bodies_of,
     keyed_linearisation,
 )
 from mortarbench.problems.families.contact import ContactFamily
@@ -143,16 +141,16 @@ class MeshedBodies(ContactFamily):
         contacts = read_description(Path(self.path))["contacts"]
         return pair_laws(contacts, self.params)
 
-    def bodies(self) -> ElasticBodies:
+    def bodies(self) -> UnassembledBodies:
         """Return the bodies; in 3D, no key may have a value for plane bodies."""
-        elastic = _bodies(self.path, self.sha256, self.plane, self.halvings)
-        if elastic.shape.dim > 2:
+        bodies = _bodies(self.path, self.sha256, self.plane, self.halvings)
+        if bodies.mesh.dim > 2:
             check_plane_only(self, "volumes")
-        return elastic
+        return bodies
 
     def rows(self) -> ContactRows:
         """Return the contact rows of the undeformed bodies."""
-        whole = self.bodies().whole
+        whole = self.bodies()
         linearise = keyed_linearisation(self.contact, self.basis)
         return linearise(whole, self.laws())(np.zeros(whole.mesh.dofs))
 
@@ -171,7 +169,7 @@ class MeshedBodies(ContactFamily):
         # if a rigid motion along frictionless contact is possible, the displacements,
         # and hence the next linearisation, are not unique
         rows = self.rows()
-        if not is_determined(problem.bodies.whole, vstack([rows.B, rows.T])):
+        if not is_determined(problem.bodies, vstack([rows.B, rows.T])):
             raise InputError(
                 f"{self.path}: supports and friction allow a rigid motion of some "
                 "body, which is not supported with several load steps; expected "
@@ -189,8 +187,7 @@ class MeshedBodies(ContactFamily):
             each other, or the load of a body cannot be balanced.
 
         """
-        elastic, laws, rows = self.bodies(), self.laws(), self.rows()
-        whole = elastic.whole
+        whole, laws, rows = self.bodies(), self.laws(), self.rows()
         overlap = -float(rows.c.min(initial=0.0))
         if not whole.f.any() and whole.lift is None and not overlap:
             raise InputError(
@@ -198,7 +195,7 @@ class MeshedBodies(ContactFamily):
                 "a displacement, or contact sides that overlap (a press fit)"
             )
         if whole.lift is not None:
-            kept = without_fixed(rows, elastic.fixed).place
+            kept = without_fixed(rows, whole.fixed).place
             depth = (rows.B @ whole.lift * whole.length - rows.c)[
                 ~np.isin(rows.place, kept)
             ]
@@ -211,13 +208,13 @@ class MeshedBodies(ContactFamily):
         stages = load_steps(
             self.steps,
             1,
-            elastic.forces,
-            elastic.fixed,
+            whole.f,
+            whole.fixed,
             laws,
             quasi_static=self.loading == "quasi-static",
         )
-        whole_load = float(np.abs(elastic.forces.value).sum()) or 1.0
-        if not elastic.is_supported:
+        whole_load = float(np.abs(whole.f).sum()) or 1.0
+        if not whole.is_supported:
             # the friction force of a tangential row can act in both directions
             with located(self.path):
                 check_balance(whole, vstack([rows.B, rows.T, -rows.T]))
@@ -226,7 +223,7 @@ class MeshedBodies(ContactFamily):
                 for stage in stages
             )
         return ContactProblem(
-            bodies=elastic,
+            bodies=whole,
             linearise=keyed_linearisation(self.contact, self.basis),
             stages=stages,
             # the first friction bound of Coulomb's law must be large enough for
@@ -294,7 +291,7 @@ def contact_remarks(family: MeshedBodies) -> tuple[str, ...]:
     overlaps of up to `MAX_OVERLAP` times the extent of the smallest body, and rows that
     are dropped because they have no free component.
     """
-    whole = family.bodies().whole
+    whole = family.bodies()
     mesh, found = whole.mesh, []
     rows = family.rows()
     depth = -float(rows.c.min(initial=0.0))
@@ -308,7 +305,7 @@ def contact_remarks(family: MeshedBodies) -> tuple[str, ...]:
             "inside its master (or behind the plane of its edge): check length_unit "
             "and the positions of the bodies, unless a press fit is meant"
         )
-    kept = without_fixed(rows, whole.B_D.indices).place
+    kept = without_fixed(rows, whole.fixed).place
     first = np.cumsum([0, *(pair.slave_nodes.size for pair in whole.pairs)])
     before, after = (np.histogram(place, first)[0] for place in (rows.place, kept))
     found += [
@@ -323,7 +320,7 @@ def contact_remarks(family: MeshedBodies) -> tuple[str, ...]:
 
 def mesh_remarks(family: MeshedBodies) -> tuple[str, ...]:
     """Return remarks on cracks, folded contact faces, and cells that are too stiff."""
-    whole = family.bodies().whole
+    whole = family.bodies()
     mesh, remarks = whole.mesh, list[str]()
     nodes = np.unique(boundary_facets(mesh.cells, mesh.dim))
     tree = KDTree(mesh.points[nodes])
@@ -374,7 +371,7 @@ def _fold(mesh: Mesh, faces: Nodes) -> Nodes | None:
 
 
 @lru_cache(maxsize=4)
-def _bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
+def _bodies(path: str, sha256: str, plane: Any, halvings: int) -> UnassembledBodies:
     """Return the bodies of a TOML file; `sha256` only distinguishes cached results."""
     del sha256
-    return elastic_bodies_of(read_bodies(Path(path), plane, halvings))
+    return read_bodies(Path(path), plane, halvings)

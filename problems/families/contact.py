@@ -141,10 +141,10 @@ class ContactFamily(NewtonFamily):
         """Return the subdomains of a form, or None for undivided bodies."""
         if form != "dual" or not (choice := self.choice(form)).size:
             return None
-        from mortarbench.problems.duality.decomposed import cached_layout, case_on_ranks
+        from mortarbench.problems.duality.decomposed import case_on_ranks, subdivided
 
         problem = self.contact_problem()
-        count = cached_layout(problem.bodies, choice.size).count
+        count = subdivided(problem.bodies.shape, choice.size).count
         return Divided(count, partial(case_on_ranks, problem, choice))
 
 

@@ -14,15 +14,17 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from mortarbench.harness.keys import Range
-from mortarbench.problems.contact.bodies import ContactPair
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    UnassembledBodies,
+    structured,
+)
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.rigid import RigidPlane
-from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
-    ElasticBodies,
-    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material
@@ -55,10 +57,10 @@ class CubeWall(ContactFamily):
     def problem(self) -> ContactProblem:
         """Return the contact problem of the cube with n × n × n cells."""
         mesh = box((0.0,) * 3, (SIDE,) * 3, (self.n,) * 3)
-        shape = structured(mesh)
-        top, areas = nodal_areas(mesh.points, shape.sides["top"])
-        forces = Forces(dofs_of(top, 3, 2), -PRESSURE * areas / FORCE)
-        right, bottom = shape.sides["right"], np.unique(shape.sides["bottom"])
+        sides, f = mesh.boundaries, np.zeros(mesh.dofs)
+        top, areas = nodal_areas(mesh.points, sides["top"])
+        f[dofs_of(top, 3, 2)] = -PRESSURE * areas / FORCE
+        right, bottom = sides["right"], np.unique(sides["bottom"])
         fixed = dofs_of(bottom, 3)
         corner = dofs_of(np.array([len(mesh.points) - 1]), 3)
 
@@ -67,18 +69,18 @@ class CubeWall(ContactFamily):
             return {"corner": (solution.at(corner) * SIDE).tolist()}
 
         return ContactProblem(
-            bodies=ElasticBodies(
-                shape=shape,
+            bodies=UnassembledBodies(
+                shape=structured(mesh),
                 names=("cube",),
                 materials=(MATERIAL,),
                 plane=None,
                 length=SIDE,
                 force=FORCE,
                 fixed=fixed,
-                forces=forces,
+                f=f,
                 pairs=(ContactPair(right, right[:0], WALL),),
             ),
-            stages=load_steps(1, 1, forces, fixed),
+            stages=load_steps(1, 1, f, fixed),
             linearise=lambda bodies, _: linearisation(bodies, "nts", "dual"),
             results=results,
         )

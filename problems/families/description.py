@@ -101,9 +101,9 @@ from mortarbench.harness.errors import shown, unknown
 from mortarbench.harness.files.reading import read_toml
 from mortarbench.problems.contact.bodies import (
     ContactPair,
+    Shape,
     UnassembledBodies,
     spring_rows,
-    support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.contact.linearise import linearisation
@@ -276,8 +276,7 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
         if support.spring
     ]
     return UnassembledBodies(
-        mesh=mesh,
-        body=body,
+        shape=Shape(mesh, body),
         names=tuple(named.surfaces),
         materials=tuple(Material(entry["E"], entry["nu"]) for entry in entries),
         plane=plane if named.dim == 2 else None,
@@ -285,7 +284,7 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
         force=force,
         f=load.ravel() / force,
         pairs=tuple(pairs),
-        B_D=support_rows(mesh, held),
+        fixed=held,
         piece=named.piece if np.bincount(named.piece).max() > 1 else None,
         lift=lift if lift.any() else None,
         springs=csr_array(vstack(springs)) * np.sqrt(length / force)
@@ -609,15 +608,14 @@ def _adjusted(
             distance = physical("adjust", checked.positive("adjust", entry["adjust"]))
             mesh = Mesh(points, named.cells, {})
             sides = UnassembledBodies(
-                mesh=mesh,
-                body=np.zeros(len(named.cells), dtype=np.int64),
+                shape=Shape(mesh, np.zeros(len(named.cells), dtype=np.int64)),
                 names=("",),
                 materials=(),
                 plane=None,
                 length=1.0,
                 force=1.0,
                 f=np.zeros(mesh.dofs),
-                B_D=support_rows(mesh, np.zeros(0, dtype=np.int64)),
+                fixed=np.zeros(0, dtype=np.int64),
                 pairs=(pair,),
             )
             rows = linearisation(sides, "nts", None)(np.zeros(points.size))

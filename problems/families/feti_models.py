@@ -36,7 +36,6 @@ from mortarbench.harness import (
 from mortarbench.harness.keys import Range
 from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.sides import active
-from mortarbench.problems.contact.stepping import Forces
 from mortarbench.problems.duality.decomposed import elastic_class
 from mortarbench.problems.duality.dualisation import (
     Transformed,
@@ -871,7 +870,7 @@ class Plate(DecomposedFamily):
             glue=self.glue,
             material=_pattern(self),
             assemble_class=partial(elastic_class, D=self.D, E=self.moduli),
-            load=_pull(mesh, self.load).on(mesh.dofs),
+            load=_pull(mesh, self.load),
             fixed=self.clamped,
             contact=Contact(no_rows(self.dim * layout.nodes), none, none),
         )
@@ -889,14 +888,16 @@ def _pattern(plate: Plate) -> NDArray[np.int64]:
     return patterns[plate.pattern]
 
 
-def _pull(mesh: Mesh, kind: str) -> Forces:
-    """Return the load, distributed over the right side by the key `load`."""
+def _pull(mesh: Mesh, kind: str) -> Vector:
+    """Return the load (n,), distributed over the right side by the key `load`."""
     nodes, share = nodal_sizes(mesh.points, mesh.boundaries["right"])
     if kind == "point":
         share = (nodes == nodes.max()).astype(float)
     elif kind == "nodal":
         share = np.ones(nodes.size)
-    return Forces(dofs_of(nodes, mesh.dim, mesh.dim - 1), -share / share.sum())
+    f = np.zeros(mesh.dofs)
+    f[dofs_of(nodes, mesh.dim, mesh.dim - 1)] = -share / share.sum()
+    return f
 
 
 def dual_quantities(moduli: Vector, qp: QP, B: csr_array) -> dict[str, Any]:

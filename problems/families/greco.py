@@ -27,17 +27,14 @@ from mortarbench.harness.keys import Range
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
+    structured,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.rigid import RigidPlane
 from mortarbench.problems.contact.rows import ContactRows
-from mortarbench.problems.contact.stepping import Forces, load_steps
-from mortarbench.problems.duality.problem import (
-    ContactProblem,
-    ElasticBodies,
-    structured,
-)
+from mortarbench.problems.contact.stepping import load_steps
+from mortarbench.problems.duality.problem import ContactProblem
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import (
@@ -102,10 +99,9 @@ class Greco(ContactFamily):
         ground, right = sides[names[0]], nodes_of_side(sides["right"])
         top, top_shares = nodal_sizes(points, sides[names[1]])
         left, left_shares = nodal_sizes(points, sides["left"])
-        forces = Forces(
-            np.concatenate([dofs_of(top, dim, 1), dofs_of(left, dim, 0)]),
-            np.concatenate([-TOP * top_shares / unit, LEFT * left_shares / unit]),
-        )
+        f = np.zeros(mesh.dofs)
+        f[dofs_of(top, dim, 1)] = -TOP * top_shares / unit
+        f[dofs_of(left, dim, 0)] = LEFT * left_shares / unit
         fixed = np.concatenate(
             [
                 dofs_of(right, dim, 0),
@@ -118,7 +114,7 @@ class Greco(ContactFamily):
         rigid = RigidPlane((0.0,) * dim, (0.0, 1.0, 0.0)[:dim])
         on_rigid = ContactPair(ground, ground[:0], rigid)
         return ContactProblem(
-            bodies=ElasticBodies(
+            bodies=UnassembledBodies(
                 shape=structured(mesh),
                 names=("plate",),
                 materials=(MATERIAL,),
@@ -126,12 +122,10 @@ class Greco(ContactFamily):
                 length=SIDE,
                 force=unit,
                 fixed=fixed,
-                forces=forces,
+                f=f,
                 pairs=(on_rigid,),
             ),
-            stages=load_steps(
-                1, 1, forces, fixed, (FrictionLaw("coulomb", mu=self.mu),)
-            ),
+            stages=load_steps(1, 1, f, fixed, (FrictionLaw("coulomb", mu=self.mu),)),
             linearise=lambda bodies, laws: linearisation(bodies, "nts", "dual", laws),
             results=lambda answer: {
                 **published_quantities(*answer.sides, thickness=thickness),

@@ -62,22 +62,20 @@ from mortarbench.harness.keys import DERIVED, Range
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
+    structured,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
 from mortarbench.problems.contact.rigid import RigidPlane
-from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
+from mortarbench.problems.contact.stepping import Stage, State, load_steps
 from mortarbench.problems.duality.case_forms import with_exact_tractions
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
-    ElasticBodies,
     Linearise,
-    Shape,
-    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.families.line_contact import LineContact, TangentialContact
@@ -156,7 +154,7 @@ class HertzPlane(ContactFamily):
 
         return ContactProblem(
             bodies=elastic,
-            stages=load_steps(1, 1, elastic.forces, elastic.fixed),
+            stages=load_steps(1, 1, elastic.f, elastic.fixed),
             linearise=lambda bodies, _: linearisation(bodies, "nts", "dual"),
             results=results,
             exact=_curve(exact),
@@ -269,7 +267,7 @@ class HertzCylinder(ContactFamily):
                 values["tresca_problems"] = answer.problems
             return values
 
-        stages = load_steps(1, 1, elastic.forces, elastic.fixed, laws)
+        stages = load_steps(1, 1, elastic.f, elastic.fixed, laws)
         has_exact = self.friction == "none" or shear is not None
         return ContactProblem(
             bodies=elastic,
@@ -282,15 +280,15 @@ class HertzCylinder(ContactFamily):
 
 def _cylinder_on_plane(
     keys: HertzPlane,
-) -> tuple[ElasticBodies, LineContact]:
+) -> tuple[UnassembledBodies, LineContact]:
     """Return the cylinder on a rigid plane with n cells per a, and Hertz's solution."""
     exact = LineContact(
         keys.load * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, keys.plane)
     )
     a = min(exact.a, RADIUS)  # see `half_cylinders`
     shape = structured(_half_cylinder(RADIUS, a / keys.n, a, keys.halvings))
-    sides = shape.sides
-    return ElasticBodies(
+    sides = shape.mesh.boundaries
+    return UnassembledBodies(
         shape=shape,
         names=("cylinder",),
         materials=(MATERIAL,),
@@ -298,12 +296,12 @@ def _cylinder_on_plane(
         length=RADIUS,
         force=exact.P,
         fixed=_on_axis(sides),
-        forces=_pressing(shape, "flat", 1.0),
+        f=_pressing(shape.mesh, "flat", 1.0),
         pairs=(ContactPair(sides["arc"], sides["arc"][:0], GROUND),),
     ), exact
 
 
-def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]:
+def _programme(keys: HertzCylinder, elastic: UnassembledBodies) -> tuple[Stage, ...]:
     """Return the stages of a tangential load: P without friction, then P and Q.
 
     In the first stage, supports on the axis fix the upper cylinder horizontally; under
@@ -312,17 +310,10 @@ def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]
     would resist. Slip in the next stage would then be measured from an arbitrary state,
     and the rolling would contribute to the work of Q.
     """
-    shape = elastic.shape
-    pressing = [
-        _pressing(shape, "upper_flat", 1.0),
-        _pressing(shape, "lower_flat", -1.0),
-    ]
+    mesh = elastic.mesh
+    pressing, shearing = elastic.f, _shearing(mesh)
     loads = _loads(keys)
     quasi_static = keys.loading == "quasi-static"
-
-    def acting(P: float, Q: float) -> Forces:
-        forces = [Forces(at, P * value) for at, value in pressing]
-        return _summed(forces + (_shearing(shape, Q * keys.mu) if Q else []))
 
     def begin(k: int, end: State) -> State:
         """Return the initial state of a stage, with normal forces in proportion to P.
@@ -336,13 +327,13 @@ def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]
         slip = u if quasi_static else np.zeros_like(u)
         return State(u, slip, loads[k][0] / previous * end.normal_forces)
 
-    fixed = np.append(elastic.fixed, _on_axis(shape.sides, "upper_"))
-    first = Stage(step=1, part=1.0, forces=acting(loads[0][0], 0.0), fixed=fixed)
+    fixed = np.append(elastic.fixed, _on_axis(mesh.boundaries, "upper_"))
+    first = Stage(step=1, part=1.0, load=loads[0][0] * pressing, fixed=fixed)
     return first, *(
         Stage(
             step=1,
             part=1.0,
-            forces=acting(P, Q),
+            load=P * pressing + Q * keys.mu * shearing,
             fixed=elastic.fixed,
             laws=(law_of(keys.friction, keys.bound, keys.mu),),
             begin=partial(begin, k),
@@ -351,7 +342,7 @@ def _programme(keys: HertzCylinder, elastic: ElasticBodies) -> tuple[Stage, ...]
     )
 
 
-def two_cylinders(keys: HertzCylinder) -> tuple[ElasticBodies, LineContact]:
+def two_cylinders(keys: HertzCylinder) -> tuple[UnassembledBodies, LineContact]:
     """Return the cylinders in contact under P alone, and Hertz's solution.
 
     Both cylinders have R = 8 mm, and touch at (0, 0). There are n (upper) and m (lower)
@@ -371,17 +362,18 @@ def two_cylinders(keys: HertzCylinder) -> tuple[ElasticBodies, LineContact]:
     upper = _half_cylinder(RADIUS, a / keys.n, a, halvings)
     lower = _half_cylinder(-RADIUS, a / keys.m, a, halvings)
     shape = structured(prefixed(upper, "upper_"), prefixed(lower, "lower_"))
-    sides, flat = shape.sides, shape.sides["lower_flat"]
-    forces, on_axis = [_pressing(shape, "upper_flat", 1.0)], _on_axis(sides, "lower_")
+    mesh, sides = shape.mesh, shape.mesh.boundaries
+    flat, on_axis = sides["lower_flat"], _on_axis(sides, "lower_")
+    f = _pressing(mesh, "upper_flat", 1.0)
     if keys.peak:
-        forces.append(_pressing(shape, "lower_flat", -1.0))
+        f += _pressing(mesh, "lower_flat", -1.0)
         fixed = np.append(on_axis, dofs_of(flat[flat.size // 2], 2, 1))
     else:
         fixed = np.concatenate(
             [_on_axis(sides, "upper_"), on_axis, dofs_of(flat, 2, 1)]
         )
     arcs = sides["upper_arc"], sides["lower_arc"]
-    return ElasticBodies(
+    return UnassembledBodies(
         shape=shape,
         names=NAMES,
         materials=materials,
@@ -389,38 +381,21 @@ def two_cylinders(keys: HertzCylinder) -> tuple[ElasticBodies, LineContact]:
         length=RADIUS,
         force=exact.P,
         fixed=fixed,
-        forces=_summed(forces),
+        f=f,
         pairs=(ContactPair(*(arcs if keys.slave == "upper" else arcs[::-1])),),
     ), exact
 
 
-def _shear_forces(points: NDArray[np.float64], Q: float) -> Vector:
-    """Return nodal forces (2k,) of a tangential force Q on a flat side: x, y per node.
-
-    points : (k, 2) nodes of the side
-    """
-    share, (x, y) = nodal_lengths(points), points.T
-    # vertical forces ∝ x balance the moment of Q about the origin
-    forces = Q * share / share.sum(), Q * y[0] * share * x / (share @ x**2)
-    return np.column_stack(forces).ravel()
-
-
-def _shearing(shape: Shape, Q: float) -> list[Forces]:
-    """Return the nodal forces of Q on the upper flat side, and of −Q on the lower."""
-    flats = (shape.sides["upper_flat"], Q), (shape.sides["lower_flat"], -Q)
-    return [
-        Forces(dofs_of(flat, 2), _shear_forces(shape.mesh.points[flat], part))
-        for flat, part in flats
-    ]
-
-
-def _summed(forces: Sequence[Forces]) -> Forces:
-    """Return the sum of forces, with each component listed once."""
-    component, value = (np.concatenate(part) for part in zip(*forces, strict=True))
-    distinct, place = np.unique(component, return_inverse=True)
-    total = np.zeros(distinct.size)
-    np.add.at(total, place, value)
-    return Forces(distinct, total)
+def _shearing(mesh: Mesh) -> Vector:
+    """Return the nodal forces (n,) of Q = 1 on the upper flat side, −1 on the lower."""
+    forces = np.zeros_like(mesh.points)
+    for side, Q in ("upper_flat", 1.0), ("lower_flat", -1.0):
+        nodes = mesh.boundaries[side]
+        share, (x, y) = nodal_lengths(mesh.points[nodes]), mesh.points[nodes].T
+        forces[nodes, 0] = Q * share / share.sum()
+        # vertical forces ∝ x balance the moment of Q about the origin
+        forces[nodes, 1] = Q * y[0] * share * x / (share @ x**2)
+    return forces.ravel()
 
 
 def _loads(keys: HertzCylinder) -> list[tuple[float, float]]:
@@ -481,11 +456,12 @@ def insert_midpoints(x: Vector, times: int) -> Vector:
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
 
 
-def _pressing(shape: Shape, flat: str, P: float) -> Forces:
-    """Return the nodal forces of a load P along −y, uniform over the side `flat`."""
-    nodes = shape.sides[flat]
-    share = nodal_lengths(shape.mesh.points[nodes])
-    return Forces(dofs_of(nodes, 2, 1), -P * share / share.sum())
+def _pressing(mesh: Mesh, flat: str, P: float) -> Vector:
+    """Return the nodal forces (n,) of P along −y, uniform over the side `flat`."""
+    f, nodes = np.zeros(mesh.dofs), mesh.boundaries[flat]
+    share = nodal_lengths(mesh.points[nodes])
+    f[dofs_of(nodes, 2, 1)] = -P * share / share.sum()
+    return f
 
 
 def pressure_quantities(

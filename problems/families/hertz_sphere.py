@@ -42,13 +42,13 @@ from mortarbench.harness.keys import Range
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
+    structured,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.results import pair_results
 from mortarbench.problems.contact.rigid import RigidPlane
 from mortarbench.problems.contact.sides import contact_sides
 from mortarbench.problems.contact.stepping import (
-    Forces,
     Stage,
     load_steps,
     restart_slip,
@@ -56,10 +56,8 @@ from mortarbench.problems.contact.stepping import (
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
-    ElasticBodies,
     Linearise,
     keyed_linearisation,
-    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.families.half_space.point_contact import (
@@ -222,26 +220,14 @@ class HertzSphere(ContactFamily):
             if self.Q:
                 fixed.append(dofs_of(axis[[0, -1]], 3, 0))
         held = np.concatenate(fixed)
-        pressing = _joined_forces(
-            [
-                _far_forces(b, partial(point_force_stress, nu=self.nu), 2)
-                for b in blocks
-            ],
-            first,
-        )
-        stages, force = load_steps(1, 1, pressing, held), pressing
+        normal = partial(point_force_stress, nu=self.nu)
+        f = pressing = np.concatenate([_far_forces(b, normal, 2) for b in blocks])
+        stages = load_steps(1, 1, f, held)
         if self.Q:
-            shearing = _joined_forces(
-                [
-                    _far_forces(b, partial(tangential_force_stress, nu=self.nu), 0)
-                    for b in blocks
-                ],
-                first,
-            )
-            force = Forces(
-                pressing.component, pressing.value + self.Q * self.mu * shearing.value
-            )
-            stages = _programme(pressing, force, held, blocks[0].axis, self.mu)
+            tangential = partial(tangential_force_stress, nu=self.nu)
+            shearing = [_far_forces(b, tangential, 0) for b in blocks]
+            f = pressing + self.Q * self.mu * np.concatenate(shearing)
+            stages = _programme(pressing, f, held, blocks[0].axis, self.mu)
 
         def results(solution: ContactSolution) -> dict[str, Any]:
             """Compare with the exact solution; `approach` is of distant points, m."""
@@ -267,7 +253,7 @@ class HertzSphere(ContactFamily):
 
         meshes = (prefixed(b.mesh, k) for b, k in zip(blocks, names, strict=True))
         return ContactProblem(
-            bodies=ElasticBodies(
+            bodies=UnassembledBodies(
                 shape=structured(*meshes),
                 names=names,
                 materials=(material,) * len(names),
@@ -275,7 +261,7 @@ class HertzSphere(ContactFamily):
                 length=self.R,
                 force=exact.P,
                 fixed=held,
-                forces=force,
+                f=f,
                 pairs=(pair,),
             ),
             stages=stages,
@@ -285,7 +271,7 @@ class HertzSphere(ContactFamily):
 
 
 def _programme(
-    pressing: Forces, both: Forces, held: Nodes, axis: Nodes, mu: float
+    pressing: Vector, both: Vector, held: Nodes, axis: Nodes, mu: float
 ) -> tuple[Stage, ...]:
     """Return the stages of a tangential load: P without friction, then P and Q.
 
@@ -295,11 +281,11 @@ def _programme(
     """
     upright = dofs_of(axis[[0, -1]], 3, 0)
     return (
-        Stage(step=1, part=1.0, forces=pressing, fixed=np.append(held, upright)),
+        Stage(step=1, part=1.0, load=pressing, fixed=np.append(held, upright)),
         Stage(
             step=1,
             part=1.0,
-            forces=both,
+            load=both,
             fixed=held,
             laws=(FrictionLaw("coulomb", mu=mu),),
             begin=restart_slip,
@@ -334,7 +320,7 @@ def _far_forces(
     block: _Block,
     stress: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     axis: int,
-) -> Forces:
+) -> Vector:
     """Return the nodal forces of the rest of the half space that balance a point force.
 
     The point force on the block at the origin is a unit force along z, away from the
@@ -365,14 +351,7 @@ def _far_forces(
         x, z = mesh.points[:, 0], mesh.points[:, 2]
         moment = z @ forces[:, 0] - x @ forces[:, 2]
         forces[nodes, 2] += moment * shares * x[nodes] / (shares @ x[nodes] ** 2)
-    nodes = np.unique(faces)
-    return Forces(dofs_of(nodes, 3), forces[nodes].ravel())
-
-
-def _joined_forces(forces: Sequence[Forces], first: Nodes) -> Forces:
-    """Return the forces on all bodies; the nodes of body k start at first[k]."""
-    components = [f.component + 3 * k for f, k in zip(forces, first, strict=False)]
-    return Forces(np.concatenate(components), np.concatenate([f.value for f in forces]))
+    return forces.ravel()
 
 
 def _approach(

@@ -41,18 +41,18 @@ from mortarbench.harness.keys import Range
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
+    UnassembledBodies,
     elasticity_matrices,
+    structured,
 )
 from mortarbench.problems.contact.friction import law_of
 from mortarbench.problems.contact.results import contact_forces
-from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
-    ElasticBodies,
     keyed_linearisation,
-    structured,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.fem.elasticity import Material
@@ -155,7 +155,7 @@ class ContactPatch(ContactFamily):
 
         def error(answer: ContactSolution) -> dict[str, Any]:
             """Return the largest |σ_y + p|/p (in 3D |σ_z + p|/p) at Gauss points."""
-            mesh, body = elastic.shape.mesh, elastic.shape.body
+            mesh, body = elastic.mesh, elastic.body
             u = answer.at(np.arange(mesh.dofs)) * elastic.length
             vertical = gauss_stress(mesh, D[body], u)[..., mesh.dim - 1]
             largest = np.abs(vertical + PRESSURE).max() / PRESSURE
@@ -165,10 +165,10 @@ class ContactPatch(ContactFamily):
             bodies=elastic,
             linearise=keyed_linearisation(self.contact, self.basis),
             results=error,
-            stages=load_steps(1, 1, elastic.forces, elastic.fixed, (law,)),
+            stages=load_steps(1, 1, elastic.f, elastic.fixed, (law,)),
             # the first friction bound of Coulomb's law must be large enough for
             # friction to support blocks that nothing else supports
-            initial_force=float(np.abs(elastic.forces.value).sum()),
+            initial_force=float(np.abs(elastic.f).sum()),
         )
 
     def finite_bodies(self) -> Bodies:
@@ -302,14 +302,14 @@ def _errors(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]
     }
 
 
-def bodies(patch: ContactPatch) -> ElasticBodies:
+def bodies(patch: ContactPatch) -> UnassembledBodies:
     """Return the stacked blocks, with `lower` and `upper` cells along x.
 
     In 3D, the numbers of cells along y are the same.
     """
     dim, force = patch.dim, PRESSURE * LENGTH ** (patch.dim - 1)
     shape = structured(*map(prefixed, _blocks(patch), ("lower_", "upper_")))
-    sides = shape.sides
+    mesh, sides = shape.mesh, shape.mesh.boundaries
     walls = ("left", "front", "bottom") if dim == 3 else ("left", "bottom")
     rollers = [
         dofs_of(nodes_of_side(sides[f"{name}_{wall}"]), dim, axis)
@@ -317,10 +317,11 @@ def bodies(patch: ContactPatch) -> ElasticBodies:
         for name in (NAMES if axis < dim - 1 else NAMES[:1])
     ]
     fixed = np.concatenate(rollers)
-    top, sizes = nodal_sizes(shape.mesh.points, sides["upper_top"])
+    f, (top, sizes) = np.zeros(mesh.dofs), nodal_sizes(mesh.points, sides["upper_top"])
+    f[dofs_of(top, dim, dim - 1)] = -PRESSURE * sizes / force
     lower, upper = sides["lower_top"], sides["upper_bottom"]
     pair = (lower, upper) if patch.slave == "lower" else (upper, lower)
-    return ElasticBodies(
+    return UnassembledBodies(
         shape=shape,
         names=NAMES,
         plane=patch.plane if dim == 2 else None,
@@ -329,7 +330,7 @@ def bodies(patch: ContactPatch) -> ElasticBodies:
         materials=(Material(patch.ratio * E_UPPER, NU), Material(E_UPPER, NU)),
         fixed=np.unique(fixed) if dim == 3 else fixed,
         pairs=(ContactPair(*pair),),
-        forces=Forces(dofs_of(top, dim, dim - 1), -PRESSURE * sizes / force),
+        f=f,
     )
 
 

@@ -1,6 +1,5 @@
 """Bodies decomposed into subdomains by labels of their cells, for tests."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,8 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.duality.decomposed import decompose
+from mortarbench.problems.duality.decomposed import decompose, subdivided
 from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
-from mortarbench.problems.duality.problem import elastic_bodies_of
-from mortarbench.problems.families.beam_ring import bodies as spectrum_of_beam_ring
 from mortarbench.problems.families.beam_ring import model
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.families.feti_models import DecomposedFamily
@@ -61,9 +58,8 @@ def parts_by(
     rows: str = "orthonormal",
 ) -> DecomposedProblem:
     """Return the QP of the bodies and its friction on the subdomains."""
-    of = elastic_bodies_of(replace(bodies, f=-primal.q))
-    (stage,) = load_steps(1, 1, of.forces, of.fixed)
-    return decompose(of, layout, rows, stage, contact_of(primal, friction))
+    (stage,) = load_steps(1, 1, -primal.q, bodies.fixed)
+    return decompose(bodies, layout, rows, stage, contact_of(primal, friction))
 
 
 def contact_of(primal: QP, friction: Friction) -> Contact:
@@ -81,7 +77,7 @@ def parts_of(name: str) -> DecomposedProblem:
         whole, friction, _ = path.problem(choice.step)
         of, stage = problem.bodies, problem.stages[path.last_of(choice.step)]
         contact = contact_of(whole.primal, friction)
-        layout = of.shape.layout(choice.size)
+        layout = subdivided(of.shape, choice.size)
         return decompose(of, layout, choice.glue, stage, contact)
     assert isinstance(case.family, DecomposedFamily)
     return case.family.in_subdomains()
@@ -95,7 +91,7 @@ def decomposed_pair(
     bodies = model(*geometry)
     contact = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, contact)
-    label = spectrum_of_beam_ring(*geometry).shape.layout(most).label
+    label = subdivided(bodies.shape, most).label
     return (
         bodies,
         primal,

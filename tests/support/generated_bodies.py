@@ -17,9 +17,6 @@ from mortarbench.harness import Case
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     assemble,
-    factorise_clamped,
-    factorise_floating,
-    factorise_supported,
 )
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
@@ -153,8 +150,5 @@ def _case(
     primal = primal_qp(bodies, rows)
     return contact_case(
         bodies, primal, rows, "dual",
-        floating=lambda: factorise_floating(bodies),
-        clamped=lambda: factorise_clamped(bodies),
-        supported=lambda: factorise_supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s, rows),
     )  # fmt: skip

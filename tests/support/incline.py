@@ -16,7 +16,6 @@ from mortarbench.problems.duality.case_forms import case_of
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
-    elastic_bodies_of,
     keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material
@@ -54,11 +53,10 @@ def incline(ratio: float, slope: float = 0.1) -> Bodies:
 def block_on_incline(ratio: float, law: FrictionLaw, *, form: str = "dual") -> Case:
     """Return the case of the block with a friction law, in one form of the QP."""
     bodies = incline(ratio)
-    of = elastic_bodies_of(bodies)
     problem = ContactProblem(
-        bodies=of,
+        bodies=bodies,
         linearise=keyed_linearisation("mortar", "dual"),
-        stages=load_steps(1, 1, of.forces, of.fixed, (law,)),
+        stages=load_steps(1, 1, bodies.f, bodies.fixed, (law,)),
         initial_force=float(np.abs(bodies.f).sum()),
     )  # fmt: skip
     return case_of(problem, form, Choice(), reference_solution)

@@ -16,17 +16,14 @@ from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
-    factorise_clamped,
-    factorise_floating,
-    factorise_supported,
 )
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.decomposed import subdivided
 from mortarbench.problems.duality.dualisation import Transformed
 from mortarbench.problems.duality.feti_dual import feti_dual
 from mortarbench.problems.duality.monolithic import primal_qp
-from mortarbench.problems.duality.problem import elastic_bodies_of
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
 from mortarbench.problems.feti.subdomains import DecomposedProblem
@@ -61,9 +58,6 @@ def disc_between_plates(
     primal = primal_qp(bodies, rows)
     return contact_case(
         bodies, primal, rows, form,
-        floating=lambda: factorise_floating(bodies),
-        clamped=lambda: factorise_clamped(bodies),
-        supported=lambda: factorise_supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s, rows),
     )  # fmt: skip
 
@@ -85,7 +79,7 @@ def disc_in_parts(
     bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
-    return parts_by(bodies, elastic_bodies_of(bodies).shape.layout(parts), primal)
+    return parts_by(bodies, subdivided(bodies.shape, parts), primal)
 
 
 def dual_of_disc_between_plates(
@@ -100,7 +94,7 @@ def dual_of_disc_between_plates(
     bodies = _disc_and_plates(n, True, False, turn, 0.0, 0.0, (70e9, 200e9, 70e9))
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
-    layout = elastic_bodies_of(bodies).shape.layout(parts)
+    layout = subdivided(bodies.shape, parts)
     return feti_dual(decompose_by_labels(bodies, layout, primal), primal)
 
 

@@ -32,6 +32,6 @@ def of_triangles(bodies: Bodies, which: NDArray[np.bool_]) -> Bodies:
         Mesh(bodies.mesh.points, np.concatenate(parts), bodies.mesh.boundaries),
         np.concatenate(owner), names=bodies.names, materials=bodies.materials,
         plane=bodies.plane, units=(bodies.length, bodies.force),
-        fixed=bodies.B_D.indices.astype(np.int64), load=bodies.f * bodies.force,
+        fixed=bodies.fixed, load=bodies.f * bodies.force,
         pairs=bodies.pairs,
     )  # fmt: skip

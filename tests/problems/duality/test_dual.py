@@ -11,10 +11,9 @@ from mortarbench.harness import QP, Solution, Status, no_rows
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.stepping import forces_of, load_steps
+from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import load_path, primal_qp, recovered
-from mortarbench.problems.families.beam_ring import bodies as bodies_of
 from mortarbench.problems.families.beam_ring import model
 from mortarbench.problems.fem.elasticity import (
     Material,
@@ -204,13 +203,12 @@ def test_recovered_points_of_the_duals_solve_the_primal_problem():
 
 def test_eliminated_supports_may_leave_rigid_motions_which_contact_balances():
     """For Hertz's sphere, both duals recover the same displacement."""
-    elastic = PROBLEMS["hertz-sphere"].with_keys(n=1).problem().bodies
-    bodies = elastic.assembled
+    bodies = PROBLEMS["hertz-sphere"].with_keys(n=1).problem().bodies.assembled
     rows = linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
     answers = []
     for dual in (
-        dualise(primal, elastic.floating), dual_bounds(primal, elastic.supported)
+        dualise(primal, bodies.floating), dual_bounds(primal, bodies.supported)
     ):  # fmt: skip
         s = reference_solution(dual.qp)
         back = dual.recover(s)
@@ -296,7 +294,7 @@ def test_the_time_of_a_dual_includes_a_cached_factorisation(form):
     for step in (1, 2):
         configured = family.with_keys(Nr=3, Nh=2, step=step)
         # the bodies of the same cached problem that `build` uses
-        bodies = configured.contact_problem().bodies
+        bodies = configured.contact_problem().bodies.assembled
         factor = {"dual": bodies.floating, "dual-bounds": bodies.clamped}[form]
         assert factor.seconds > 0
         case = configured.build(form, reference_solution)
@@ -324,11 +322,11 @@ def test_a_path_of_many_steps_recovers_only_requested_steps(factorise, transform
     geometry = (3, 2, 4, "strain")
     bodies, inverse = (
         model(*geometry),
-        Counted(getattr(bodies_of(*geometry), factorise)),
+        Counted(getattr(model(*geometry), factorise)),
     )
     linearise = linearisation(bodies, "nts", "dual")
     path = load_path(
-        bodies, load_steps(6, 1, forces_of(bodies.f), bodies.B_D.indices),
+        bodies, load_steps(6, 1, bodies.f, bodies.fixed),
         lambda _: linearise, lambda _: inverse, reference_solution, transform,
     )  # fmt: skip
 
@@ -350,7 +348,7 @@ def test_a_dual_solution_has_its_displacements_on_the_contact_sides(
     family, geometry = PROBLEMS["beam-ring"], (3, 2, 4, "strain")
     configured = family.with_keys(Nr=3, Nh=2)
     primal = configured.build("primal", reference_solution).qp
-    dual = transform(primal, getattr(bodies_of(*geometry), factorise))
+    dual = transform(primal, getattr(model(*geometry), factorise))
     s = reference_solution(dual.qp)
     sides, u = np.unique(primal.G.nonzero()[1]), dual.recover(s).x
 

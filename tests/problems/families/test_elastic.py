@@ -63,10 +63,10 @@ def test_friction_can_balance_a_tangential_load():
     """Without friction, the tangential load on the upper block is not balanced."""
     bodies = model(PATCH.with_keys(**STRETCHED))
     upper = bodies.body_of_node == 1
-    free = ~np.isin(bodies.B_D.indices, 2 * np.flatnonzero(upper))
+    free = ~np.isin(bodies.fixed, 2 * np.flatnonzero(upper))
     push = np.zeros(bodies.f.size)
     push[2 * np.flatnonzero(upper)] = 0.01 / upper.sum()
-    pushed = replace(bodies, B_D=bodies.B_D[free], f=bodies.f + push)
+    pushed = replace(bodies, fixed=bodies.fixed[free], f=bodies.f + push)
 
     with pytest.raises(InputError, match="upper"):
         one_step(pushed, "dual")

@@ -15,7 +15,7 @@ from mortarbench.problems.contact.bodies import ContactPair, assemble, factorise
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.rows import ContactRows, rows_along
-from mortarbench.problems.contact.stepping import forces_of, load_steps
+from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.contact.surface import tangents
 from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.families.patch import model
@@ -323,7 +323,7 @@ def test_a_divergent_fixed_point_iteration_ends_with_its_last_residual(load):
     first = np.zeros(1, dtype=np.int64)
     rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first, np.ones(1), first)
     laws = (FrictionLaw("coulomb", mu=0.5),)
-    stages = load_steps(1, 1, forces_of(bodies.f), bodies.B_D.indices, laws)
+    stages = load_steps(1, 1, bodies.f, bodies.fixed, laws)
     path = load_path(
         bodies, stages, lambda _: lambda u: rows, lambda _: factorise_clamped(bodies),
         reference_solution,

@@ -270,13 +270,10 @@ def test_the_tangential_force_rotates_no_body():
     keys = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
     configured = CYLINDER.with_keys(**keys)
     stated = configured.problem()
-    first, last = stated.stages[0].forces, stated.stages[-1].forces
+    first, last = stated.stages[0].load, stated.stages[-1].load
     bodies = stated.bodies.assembled
     (x, y), upper = bodies.mesh.points.T, bodies.body_of_node == 0
-    load = np.zeros(bodies.mesh.dofs)
-    load[last.component] = last.value / (0.5 * 0.5)  # unit of Q is μP
-    load[first.component] -= first.value / (0.5 * 0.5)
-    load = load.reshape(-1, 2)
+    load = (last - first).reshape(-1, 2) / (0.5 * 0.5)  # unit of Q is μP
     case = configured.build("dual", reference_solution)
 
     for body, Q in ((upper, 1.0), (~upper, -1.0)):
@@ -343,7 +340,7 @@ def test_cells_keep_their_area_if_the_contact_is_wider_than_the_cylinder(ratio):
     """If the uniformly meshed arc left the half disc, K would be indefinite."""
     bodies, exact = two_cylinders(HertzCylinder(n=3, m=2, ratio=ratio))
     assert exact.a > 4 * 0.008
-    mesh = bodies.shape.mesh
+    mesh = bodies.mesh
     x, y = np.moveaxis(mesh.points[mesh.cells], -1, 0)
     area = 0.5 * (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1)
     half_discs = np.pi * 0.008**2

@@ -10,7 +10,7 @@ from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.verdicts import certified
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.duality import problem
+from mortarbench.problems.contact import bodies
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.press import described
@@ -82,8 +82,8 @@ def test_the_first_step_factorises_no_undecomposed_body(monkeypatch):
     def refused(*_: object) -> None:
         raise AssertionError("a factor of the whole")
 
-    monkeypatch.setattr(problem, "factorise_clamped", refused)
-    monkeypatch.setattr(problem, "factorise_floating", refused)
+    monkeypatch.setattr(bodies, "factorise_clamped", refused)
+    monkeypatch.setattr(bodies, "factorise_floating", refused)
     case = built("beam-ring/Nr=2/Nh=3/steps=2/step=1/feti=2/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
     assert certified(case, s)[0]["energy_bound"] <= 1e-5

@@ -11,11 +11,10 @@ from mortarbench.problems.contact.bodies import (
     ContactPair,
     assemble,
     factorise_clamped,
-    factorise_floating,
 )
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
-from mortarbench.problems.contact.stepping import forces_of, load_steps
+from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.case_forms import contact_case
 from mortarbench.problems.duality.monolithic import load_path as monolithic_path
 from mortarbench.problems.duality.monolithic import recovered
@@ -35,7 +34,7 @@ def again(bodies, *, units=None, mesh=None, pairs=None, load=None):
     return assemble(
         mesh or bodies.mesh, bodies.body, names=bodies.names,
         materials=bodies.materials, plane=bodies.plane,
-        units=units or (bodies.length, bodies.force), fixed=bodies.B_D.indices,
+        units=units or (bodies.length, bodies.force), fixed=bodies.fixed,
         load=bodies.f * bodies.force if load is None else load,
         pairs=pairs or bodies.pairs,
     )  # fmt: skip
@@ -67,7 +66,7 @@ def sign(bodies):
 def load_path(bodies, contact, basis, relin=1):
     linearise = linearisation(bodies, contact, basis)
     return monolithic_path(
-        bodies, load_steps(STEPS, relin, forces_of(bodies.f), bodies.B_D.indices),
+        bodies, load_steps(STEPS, relin, bodies.f, bodies.fixed),
         lambda _: linearise, lambda _: factorise_clamped(bodies), reference_solution,
     )  # fmt: skip
 
@@ -82,9 +81,7 @@ def results(bodies, contact, basis, form):
     last = load_path(bodies, contact, basis).problem(STEPS).problem
     primal, rows = last.primal, last.rows
     case = contact_case(
-        bodies, primal, rows, form, floating=lambda: factorise_floating(bodies),
-        clamped=lambda: factorise_clamped(bodies),
-        supported=lambda: factorise_clamped(bodies),
+        bodies, primal, rows, form,
         quantities=lambda s: quantities(bodies, primal, s, rows),
     )  # fmt: skip
     s = SMALBE().prepare(case.qp, 1e-12)()

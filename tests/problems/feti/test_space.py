@@ -8,9 +8,13 @@ from scipy.sparse import csr_array
 from mortarbench.harness import Status
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.contact.stepping import Forces, load_steps
-from mortarbench.problems.duality.decomposed import decompose, longitudinal_share
-from mortarbench.problems.duality.problem import ElasticBodies, Shape
+from mortarbench.problems.contact.bodies import Shape, UnassembledBodies
+from mortarbench.problems.contact.stepping import load_steps
+from mortarbench.problems.duality.decomposed import (
+    decompose,
+    longitudinal_share,
+    subdivided,
+)
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
 from mortarbench.problems.feti.subdomains import Contact, TornBodies
@@ -36,15 +40,16 @@ def torn(
 ) -> TornBodies:
     """Divide a body under gravity into subdomains by METIS."""
     down = dofs_of(np.arange(len(mesh.points)), 3, 2)
-    forces = Forces(down, np.full(down.size, -1.0))
+    f = np.zeros(mesh.dofs)
+    f[down] = -1.0
     body = np.zeros(len(mesh.cells), dtype=np.int64)
-    of = ElasticBodies(
+    of = UnassembledBodies(
         shape=Shape(mesh, body), names=("box",), materials=(STEEL,),
-        plane=None, length=1.0, force=STEEL.E, fixed=fixed, forces=forces, pairs=(),
+        plane=None, length=1.0, force=STEEL.E, fixed=fixed, f=f, pairs=(),
     )  # fmt: skip
-    (stage,) = load_steps(1, 1, forces, fixed)
+    (stage,) = load_steps(1, 1, f, fixed)
     none = Contact(csr_array((0, mesh.dofs)), np.zeros(0), np.zeros(0))
-    layout = of.shape.layout(parts)
+    layout = subdivided(of.shape, parts)
     return TornBodies(decompose(of, layout, glue, stage, none))
 
 

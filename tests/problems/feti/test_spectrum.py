@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Vector, no_rows
 from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.duality.decomposed import decompose
+from mortarbench.problems.duality.decomposed import decompose, subdivided
 from mortarbench.problems.duality.feti_dual import TornDual
 from mortarbench.problems.families.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.families.feti_models import Membranes
@@ -107,7 +107,7 @@ def dual_of(problem: DecomposedProblem) -> tuple[QP, csr_array]:
 @pytest.mark.parametrize("rows", ["orthonormal", "redundant"])
 def test_the_projector_is_onto_the_kernel_of_g_in_the_range_of_b(rows: str) -> None:
     bodies, primal, _ = decomposed_pair(rows)
-    label = of_beam_ring(4, 3, 6, "strain").shape.layout(2).label
+    label = subdivided(bodies.shape, 2).label
     primal = replace(primal, G=no_rows(primal.q.size), h=np.zeros(0))
     parts = parts_by(bodies, labelled(bodies, label), primal, rows=rows)
     qp, B = dual_of(parts)
@@ -129,8 +129,8 @@ def spectrum_of_beam_ring(layers: int, cells: int) -> Spectrum:
     """Compute the spectrum for supports and gluing of beam and ring, without
     contact."""
     bodies = of_beam_ring(layers, layers // 2, layers, "strain")
-    (stage,) = load_steps(1, 1, bodies.forces, bodies.fixed)
-    layout = bodies.shape.layout(cells)
+    (stage,) = load_steps(1, 1, bodies.f, bodies.fixed)
+    layout = subdivided(bodies.shape, cells)
     contact = Contact(no_rows(2 * layout.nodes), np.zeros(0), np.zeros(0))
     parts = decompose(bodies, layout, "orthonormal", stage, contact)
     (result,) = spectra(*dual_of(parts), tol=1e-3)

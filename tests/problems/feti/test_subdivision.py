@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mortarbench.problems.duality.problem import structured
+from mortarbench.problems.contact.bodies import structured
+from mortarbench.problems.duality.decomposed import subdivided
 from mortarbench.problems.fem.mesh import half_disc, half_ring, join, rectangle
 from mortarbench.problems.feti.subdomains import subdomain_ranks
 from mortarbench.problems.feti.tearing import compact_blocks, joined_labels
@@ -32,12 +33,12 @@ def torn(parts, label):
 
 def grids(most):
     label = structured_bodies([grid.divisions for grid in GRIDS], most)
-    return structured(*GRIDS).layout(most), *torn(GRIDS, label)
+    return subdivided(structured(*GRIDS), most), *torn(GRIDS, label)
 
 
 def discs(most):
     label = joined_labels([compact_blocks(disc.grid, most) for disc in DISCS])
-    return structured(*DISCS).layout(most), *torn(DISCS, label)
+    return subdivided(structured(*DISCS), most), *torn(DISCS, label)
 
 
 @pytest.fixture(
