@@ -38,7 +38,7 @@ from libc.stdlib cimport calloc, free as release_memory, realloc
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dsymv
 from scipy.linalg.cython_lapack cimport (
-    dgeqp3, dorgqr, dpotrf, dpotrs,
+    dgeqp3, dorgqr, dpotrf, dpotrs, dstev,
 )
 
 from mortarbench.harness.distributed.sparse cimport (
@@ -65,78 +65,42 @@ cdef extern from "vectors.h" nogil:
         const double *data
         const double *diagonals
     int MAX_DIAGONALS
+    double STEP_ROUNDING
     Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *offset,
                               signed char *slot)
     void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
     void sparse_product(const sparse *F, double s, const double *v, double *y)
-    double update_free_direction(const double *g, const double *free, double gamma, double *p,
-                       Py_ssize_t n)
     double dot(const double *a, const double *b, Py_ssize_t n)
+    void two_dots(const double *a, const double *b, const double *c, Py_ssize_t n,
+                  double *sums)
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
     void copy_scaled(double s, const double *a, double *b, Py_ssize_t n)
-    double scale_free(double s, const double *free, const double *v, double *z,
-                      Py_ssize_t n)
     bint same(const double *a, const double *b, Py_ssize_t n)
     void rows_times(const double *U, const double *v, double *c, Py_ssize_t k,
                     Py_ssize_t n)
-    void combination(double s, const double *U, const double *c, const double *v,
-                     double *y, Py_ssize_t k, Py_ssize_t n)
+    void add_outer(double s, const double *U, Py_ssize_t n, double *S, Py_ssize_t k)
     void add_combination(double s, const double *U, const double *c, double *y,
                          Py_ssize_t k, Py_ssize_t n)
+    void masked(const double *free, const double *a, double *t, Py_ssize_t n)
+    void update_direction(const double *z, double gamma, double *p, Py_ssize_t n)
     double first_bound(const double *x, const double *p, const double *lower,
-                       const double *upper, Py_ssize_t n)
-    void lengths(const double *x, const double *g, const double *p, const double *Hp,
-                 const double *lower, const double *upper, Py_ssize_t n, double *result)
-    void leave_box(double alpha, double beta, bint release, double *x, double *g,
-               const double *p, const double *Hp, const double *lower,
-               const double *upper, double *x0, double *g0, double *free,
-               double *box_lower, double *box_upper, double *z, double *z_g,
-               Py_ssize_t n)
+                       const double *upper, double least, Py_ssize_t n)
     void split(const double *x, const double *g, const double *lower,
                const double *upper, double tau, double *phi, double *free,
                Py_ssize_t n, double *result)
     void advance(double alpha, double *x, double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, double tau, double *phi,
                  double *free, Py_ssize_t n, double *result)
-    double within(const double *x, const double *origin, const double *g,
-                  const double *lower, const double *upper, bint release, double *s,
-                  Py_ssize_t n)
-    double model_minimiser_within(const double *x, const double *x_g, double tau,
-                         const double *origin, const double *g, const double *lower,
-                         const double *upper, double *s, Py_ssize_t n)
-    void rest_of_step(const double *x, const double *g, const double *s,
-                      const double *Hs, const double *z_g, double *z, Py_ssize_t n,
-                      double *result)
-    void projected(const double *x, const double *g, double tau, const double *lower,
+    void projected(const double *x, double alpha, const double *p, const double *lower,
                    const double *upper, double *y, Py_ssize_t n)
-    bint negate(double *s, Py_ssize_t n)
-    double update_direction(const double *z, double gamma, double *p, Py_ssize_t n)
-    void advance_freely(double alpha, double *x, double *g, const double *p,
-                        const double *Hp, const double *free, Py_ssize_t n,
-                        double *result)
-    void symmetric_product(const double *F, double s, const double *v, double *y,
-                           Py_ssize_t n)
-    void transposed(const double *U, double *columns, Py_ssize_t k, Py_ssize_t n,
-                    Py_ssize_t stride)
-    void add_gram(const double *s, const double *V, const int *row, double *S,
-                  Py_ssize_t k)
-    void scaled(const double *root, const double *G, double tau, double *S,
-                Py_ssize_t k, Py_ssize_t stride)
-    int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
-    void solve(const double *R, const double *inverse, double *y, Py_ssize_t stride)
-    Py_ssize_t changed(const double *piece, double *active, Py_ssize_t n, int *where)
-    void model_minimiser(const double *x, const double *g, double tau, const double *lower,
-                const double *upper, double *s, double *piece, Py_ssize_t n)
-    void restored(const double *nu, const double *shift, const double *lower,
-                  const double *upper, const double *lb, const double *ub, double *x,
-                  double *free, Py_ssize_t n)
-    void bound_multipliers(const double *nu, const double *lower, const double *upper,
-                 const double *g, double *z, Py_ssize_t n)
-    void masked(const double *free, const double *a, double *t, Py_ssize_t n)
+    void model_minimiser(const double *x, const double *g, double tau,
+                         const double *lower, const double *upper, double *s,
+                         double *piece, Py_ssize_t n)
     void terms_of_test(const double *x, const double *Px, const double *q,
                        const double *r, const double *w, Py_ssize_t n, double *sums,
                        double *most)
+    void solve_cholesky(const double *L, double *y, Py_ssize_t k)
 
 cdef extern from "incomplete.h" nogil:
     int RUN
@@ -162,38 +126,9 @@ cdef extern from "incomplete.h" nogil:
     void find_runs(incomplete *F, const double *free, Py_ssize_t most)
     bint factorise_incompletely(incomplete *F, const double *free, double keep,
                                 double shift, double least)
-    double solve_incompletely(const incomplete *F, const double *v, const double *along,
-                              double *z)
-    double projected_step(const double *x, const double *z, const double *g,
-                          const double *lower, const double *upper, double *s,
-                          Py_ssize_t n)
+    void solve_incompletely(const incomplete *F, const double *v, double *z)
     void scaled_matrix(const int *indptr, const int *indices, const double *data,
                        const double *s, double *scaled, Py_ssize_t n, double *row_sums)
-
-cdef extern from "discs.h" nogil:
-    ctypedef struct discs:
-        Py_ssize_t count, ranges
-        int dim
-        const int *start
-        const int *index
-        const double *radius
-        const double *slack
-        const double *centre
-        const Py_ssize_t *range
-    void project_discs(const discs *D, double *y)
-    double first_disc(const discs *D, const double *x, const double *p, double least)
-    void split_discs(const discs *D, const double *x, const double *g, double tau,
-                     double *phi, double *free, double *result)
-    void advance_discs(const discs *D, double alpha, double *x, double *g,
-                       const double *p, const double *Hp, double tau, double *phi,
-                       double *free, double *result)
-    void project_gradient_on_discs(const discs *D, const double *x, double *g)
-    void chop_discs(const discs *D, const double *x, const double *g, double *beta)
-    int mark_discs(const discs *D, const double *x, double *free)
-    void tangential_discs(const discs *D, const double *x, const double *g,
-                          const double *v, double *w)
-    void step_on_discs(const discs *D, const double *x, const double *g, double length,
-                       bint free_only, double *s, double *result)
 
 include "operations.pxi"
 include "coarse.pxi"

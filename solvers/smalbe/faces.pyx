@@ -4,13 +4,12 @@
 
 The class `Faces` updates the Cholesky factor of the Hessian on the free components. A
 row is appended for a component that becomes free. If a component reaches a bound, its
-row is removed, and the rows below are restored by Givens rotations or by a new
-factorisation of these rows (Golub and Van Loan, Matrix Computations, 4th ed., 6.5.4).
+row is removed, and the rows below are factorised again.
 `solvers.smalbe.direct` uses this class.
 """
 
 from cpython.exc cimport PyErr_CheckSignals
-from libc.math cimport fabs, fmax, fmin, hypot, sqrt
+from libc.math cimport fabs, fmax, fmin, sqrt
 from libc.string cimport memcpy
 from scipy.linalg.cython_blas cimport dgemm, dsymv, dsyrk, dtrsm, dtrsv
 from scipy.linalg.cython_lapack cimport dpotrf
@@ -23,9 +22,6 @@ cdef double ROUNDING = 8 * 2.0 ** -52  # rounding of a sum, relative to the abso
 cdef double RELEASE_SHARE = 0.9
 # diagonal entries below this factor times their mean count as zero
 cdef double FLAT = 1e-12
-# cost of removing a row by rotations, in units of a factorised row
-cdef int GIVENS_COST = 6
-
 
 def _whole(a):
     return np.ascontiguousarray(a, dtype=float)
@@ -53,7 +49,6 @@ cdef class Faces:
     cdef const double[::1] q, x_tilde, lower, upper
     cdef readonly object diagonal
     cdef double[::1] d, D, mu, off, centre, near, noise, size, x, g, y, gy, step
-    cdef double[::1] cosine, sine
     cdef signed char[::1] free, wanted, face
     cdef int[::1] order, place
 
@@ -73,10 +68,10 @@ cdef class Faces:
         self.mu, self.off = np.zeros((2, self.r))
         self.diagonal = np.empty(n)
         self.d = self.diagonal
-        cdef double[:, ::1] room = np.zeros((12, n))
+        cdef double[:, ::1] room = np.zeros((10, n))
         self.D, self.centre, self.near, self.noise = room[0], room[1], room[2], room[3]
         self.size, self.x, self.g, self.y = room[4], room[5], room[6], room[7]
-        self.gy, self.step, self.cosine, self.sine = room[8], room[9], room[10], room[11]
+        self.gy, self.step = room[8], room[9]
         self.free, self.wanted, self.face = np.zeros((3, n), dtype=np.int8)
         self.order, self.place = np.full((2, n), -1, dtype=np.int32)
         for i in range(n):
@@ -134,22 +129,16 @@ cdef class Faces:
             if not self.wanted[self.order[j]]:
                 gone += 1
                 first = min(first, j)
-        if gone * GIVENS_COST <= first + (self.k - first) / 3:
-            for j in range(self.k - 1, first - 1, -1):
-                if not self.wanted[self.order[j]]:
-                    self.remove(j)
-            base = self.k
-        else:
-            kept = base = first
-            for j in range(first, self.k):
-                i = self.order[j]
-                if self.wanted[i]:
-                    memcpy(&self.L[kept, 0], &self.L[j, 0], base * sizeof(double))
-                    self.put(kept, i)
-                    kept += 1
-                else:
-                    self.place[i] = -1
-            self.k = kept
+        kept = base = first
+        for j in range(first, self.k):
+            i = self.order[j]
+            if self.wanted[i]:
+                memcpy(&self.L[kept, 0], &self.L[j, 0], base * sizeof(double))
+                self.put(kept, i)
+                kept += 1
+            else:
+                self.place[i] = -1
+        self.k = kept
         self.left += gone
         unchanged = self.k
         for i in range(self.n):
@@ -187,25 +176,6 @@ cdef class Faces:
         self.order[j], self.place[i], self.among[j, 0] = i, j, 0.0
         for m in range(self.r):
             self.among[j, m] = self.C[m, i]
-
-    cdef void remove(self, Py_ssize_t p):
-        """Remove row p of the factor; Givens rotations restore the rows below."""
-        cdef Py_ssize_t r, j
-        cdef double a, size
-        cdef double *row
-        self.place[self.order[p]] = -1
-        self.k -= 1
-        for r in range(p, self.k):
-            self.put(r, self.order[r + 1])
-            row = &self.L[r, 0]
-            memcpy(row, &self.L[r + 1, 0], (r + 2) * sizeof(double))
-            for j in range(p, r):
-                a = row[j]
-                row[j] = self.cosine[j] * a + self.sine[j] * row[j + 1]
-                row[j + 1] = self.cosine[j] * row[j + 1] - self.sine[j] * a
-            size = hypot(row[r], row[r + 1])
-            self.cosine[r], self.sine[r] = row[r] / size, row[r + 1] / size
-            row[r] = size
 
     cdef void solve(self):
         """Replace the first k components of `step` by (LLᵀ)⁻¹ step."""

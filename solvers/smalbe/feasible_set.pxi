@@ -20,75 +20,63 @@ cdef struct Parts:
     # feasible direction
     double beta_square
     double reduced_square  # φ̃ᵀφ; φ̃ is φ, reduced such that x − φ̃/τ is feasible
-    double phi_Hp  # φᵀHp after a step along p
 
 
 @cython.final
 cdef class FeasibleSet:
-    """The box l ≤ x ≤ u, and discs over variables without bounds.
+    """The box l ≤ x ≤ u, and discs ‖x_I + c_I‖ ≤ r over variables without bounds.
 
-    Each operation passes over the vectors once and computes all sums that a step needs,
-    because separate operations would read each vector several times per CG step. Either
-    all variables of a disc are free, or all of them are active (discs.h).
+    Either all variables of a disc are free, or all of them are active. A disc is active
+    if the distance of x to its boundary is at most `slack`. The chopped gradient β on
+    an active disc is the gradient g, but if nᵀg < 0 with the outward normal n, the
+    normal component of g is subtracted. On a disc of radius zero, φ = β = 0.
     """
 
-    cdef Py_ssize_t n
+    cdef Py_ssize_t n, n_discs
+    # bounds; NaN for variables of discs, which no comparison in a loop over bounds
+    # therefore counts as free or active
     cdef const double *lower
     cdef const double *upper
-    cdef const double *upper_if_any  # NULL if all upper bounds are inf
-    cdef discs D  # the count may be zero
+    cdef const int *start  # (n_discs + 1,) first entry of each disc in `index`
+    cdef const int *index  # variables of the discs
+    cdef const double *radius
+    cdef double *slack  # (n_discs,) rounding error of ‖x_I + c_I‖
+    cdef const double *shift  # (n,) c, zeros if there are no equality rows
     cdef bint has_discs
-    cdef object arrays  # keeps the memory that D points to
+    cdef object arrays  # keeps the memory of the discs
 
     @staticmethod
     cdef FeasibleSet of(const double *lower, const double *upper, Py_ssize_t n):
         cdef FeasibleSet new = FeasibleSet.__new__(FeasibleSet)
-        cdef Py_ssize_t i
         new.n, new.lower, new.upper = n, lower, upper
-        for i in range(n):
-            if upper[i] < INFINITY:
-                new.upper_if_any = upper
-                break
         return new
 
     cdef int add_discs(self, sets, const double *shift) except -1:
         """Add discs ‖x_I + shift_I‖ ≤ r.
 
         sets : at least one `harness.sets.discs.Discs`
-        shift : (n,), NULL for zero
+        shift : (n,)
         """
-        cdef const int[::1] start, index
-        cdef const double[::1] radius
-        cdef double[::1] slack
-        cdef Py_ssize_t[::1] ranges
         cdef Py_ssize_t i
-        cdef double square
-        sizes = np.concatenate([
-            np.full(len(one.radius), one.index.shape[1]) for one in sets
-        ])
-        starts = np.concatenate([[0], np.cumsum(sizes)])
-        start = starts.astype(np.int32)
-        indices = np.concatenate([one.index.ravel() for one in sets])
-        index = indices.astype(np.int32)
-        radius = np.concatenate([np.asarray(one.radius) for one in sets])
-        slack = np.empty(len(sizes))
-        is_off = np.ones(self.n + 2, dtype=bool)
-        is_off[indices + 1] = is_off[0] = is_off[self.n + 1] = False
-        ranges = np.flatnonzero(np.diff(is_off)).astype(np.intp)
-        self.arrays = start, index, radius, slack, ranges
-        self.has_discs = True
-        self.D.count, self.D.ranges = len(sizes), ranges.size // 2
-        self.D.start, self.D.index, self.D.radius = &start[0], &index[0], &radius[0]
-        self.D.slack, self.D.centre = &slack[0], shift
-        self.D.dim = sizes[0] if len(sizes) and (sizes == sizes[0]).all() else 0
-        if ranges.size:
-            self.D.range = &ranges[0]
-        for i in range(self.D.count):
-            square = 0.0
-            if shift:
-                for k in index[start[i]:start[i + 1]]:
-                    square += shift[k] * shift[k]
-            slack[i] = DISC_ROUNDING * (radius[i] + sqrt(square))
+        cdef list owners = []
+        sizes = [np.full(len(one.radius), one.index.shape[1]) for one in sets]
+        starts = _integers(np.cumsum(np.concatenate([[0], *sizes])))
+        indices = _integers(np.concatenate([one.index.ravel() for one in sets]))
+        lower, upper = copied(self.lower, self.n), copied(self.upper, self.n)
+        for one in sets:
+            lower[one.index] = upper[one.index] = np.nan
+        self.n_discs, self.has_discs, self.shift = len(starts) - 1, True, shift
+        slack = empty(self.n_discs)
+        self.start = <const int *> cnp.PyArray_DATA(starts)
+        self.index = <const int *> cnp.PyArray_DATA(indices)
+        self.radius = read(np.concatenate([one.radius for one in sets]), owners)
+        self.slack, self.lower, self.upper = address(slack), address(lower), address(upper)
+        self.arrays = starts, indices, slack, lower, upper, owners
+        origin = zeros(self.n)
+        for i in range(self.n_discs):
+            self.slack[i] = DISC_ROUNDING * (
+                self.radius[i] + sqrt(self.square_of_disc(i, address(origin)))
+            )
         return 0
 
     cdef bint has_bound(self, Py_ssize_t i) noexcept:
@@ -99,122 +87,128 @@ cdef class FeasibleSet:
     ) noexcept:
         """y ← Π(x − αp), with the projection Π onto the set."""
         cdef Py_ssize_t i
-        for i in range(self.n):
-            y[i] = fmin(fmax(x[i] - alpha * p[i], self.lower[i]), self.upper[i])
-        if self.D.count:
-            project_discs(&self.D, y)
+        cdef double square
+        projected(x, alpha, p, self.lower, self.upper, y, self.n)
+        for i in range(self.n_discs):
+            square = self.square_of_disc(i, y)
+            if square > self.radius[i] * self.radius[i]:
+                self.scale_disc(i, self.radius[i] / sqrt(square), y)
+
+    cdef void minimise(
+        self, const double *x, const double *g, double tau, double *s
+    ) noexcept:
+        """s ← argmin of gᵀs + τ/2‖s‖² over all s with x + s in the set."""
+        self.project(x, 1 / tau, g, s)
+        add(-1.0, x, s, self.n)
 
     cdef void lengths(self, const double *x, const double *g, const double *p,
                       const double *Hp, Line *line) noexcept:
         """Compute the step lengths along x − αp."""
-        if not self.has_discs:
-            lengths(x, g, p, Hp, self.lower, self.upper_if_any, self.n, &line.cg)
-            return
-        line.slope, line.curvature = dot(g, p, self.n), dot(p, Hp, self.n)
-        line.feasible = self.feasible_length(x, p)
+        two_dots(g, p, Hp, self.n, &line.slope)
         line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
+        line.feasible = self.feasible_length(x, p, line.cg)
+        if line.feasible >= line.cg:
+            line.feasible = INFINITY
 
-    cdef double feasible_length(self, const double *x, const double *p) noexcept:
-        """Return the largest α for which x − αp is in the set."""
-        cdef double least = INFINITY
-        cdef Py_ssize_t i, o, size
-        if not self.has_discs:
-            return first_bound(x, p, self.lower, self.upper_if_any, self.n)
-        for i in range(self.D.ranges):
-            o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
-            least = fmin(least, first_bound(x + o, p + o, self.lower + o,
-                                            self.upper + o, size))
-        return first_disc(&self.D, x, p, least)
+    cdef double feasible_length(
+        self, const double *x, const double *p, double least
+    ) noexcept:
+        """Return the largest α for which x − αp is in the set, at most `least`."""
+        cdef Py_ssize_t i, j, k
+        cdef double a, b, c, r, root
+        least = first_bound(x, p, self.lower, self.upper, least, self.n)
+        for i in range(self.n_discs):
+            a, b, c, r = 0.0, 0.0, self.square_of_disc(i, x), self.radius[i]
+            for k in range(self.start[i], self.start[i + 1]):
+                j = self.index[k]
+                a += p[j] * p[j]
+                b += (x[j] + self.shift[j]) * p[j]
+            # a α² − 2bα + c − r² ≤ 0 in the disc: convex, and true at α = 0
+            if a == 0 or (least < INFINITY and (a * least - 2 * b) * least + c < r * r):
+                continue
+            c = fmin((sqrt(c) - r) * (sqrt(c) + r), 0.0)  # without cancellation
+            root = sqrt(b * b - a * c)
+            least = fmin(least, (b + root) / a if b >= 0 else -c / (root - b))
+        return least
 
     cdef void split(self, const double *x, const double *g, double tau, double *phi,
                     double *free, Parts *parts) noexcept:
         """Compute φ and `free` (1 off the boundary, else 0) for the face of x."""
-        cdef Py_ssize_t i, o, size
-        cdef double sums[3]
-        if self.has_discs:
-            parts.phi_square = parts.beta_square = parts.reduced_square = 0.0
-            for i in range(self.D.ranges):
-                o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
-                split(x + o, g + o, self.lower + o, self.upper + o, tau, phi + o,
-                      free + o, size, sums)
-                parts.phi_square += sums[0]
-                parts.beta_square += sums[1]
-                parts.reduced_square += sums[2]
-            split_discs(&self.D, x, g, tau, phi, free, &parts.phi_square)
-            return
         split(x, g, self.lower, self.upper, tau, phi, free, self.n, &parts.phi_square)
+        self.split_discs(x, g, tau, phi, free, parts)
+
+    cdef void split_discs(self, const double *x, const double *g, double tau,
+                          double *phi, double *free, Parts *parts) noexcept:
+        """Write φ and `free` on discs, and add their `parts`."""
+        cdef Py_ssize_t i, j, k
+        cdef double square, factor, u, b, cut, inward, r
+        for i in range(self.n_discs):
+            square, r = self.square_of_disc(i, x), self.radius[i]
+            if self.is_inside(i, square):
+                factor = 0.0
+                for k in range(self.start[i], self.start[i + 1]):
+                    j = self.index[k]
+                    u = x[j] + self.shift[j] - g[j] / tau
+                    factor += u * u
+                factor = r / sqrt(factor) if factor > r * r else 1.0
+                for k in range(self.start[i], self.start[i + 1]):
+                    j = self.index[k]
+                    u = x[j] + self.shift[j]
+                    cut = g[j]
+                    if factor < 1:
+                        cut = tau * u - factor * (tau * u - g[j])
+                    parts.phi_square += g[j] * g[j]
+                    parts.reduced_square += cut * g[j]
+                    phi[j], free[j] = g[j], 1.0
+                continue
+            inward = self.inward_share(i, x, g, square)
+            for k in range(self.start[i], self.start[i + 1]):
+                j = self.index[k]
+                # a difference of squares would suffer from cancellation
+                b = g[j] - inward * (x[j] + self.shift[j]) if r > 0 else 0.0
+                parts.beta_square += b * b
+                phi[j] = free[j] = 0.0
 
     cdef void advance(self, double alpha, double *x, double *g, const double *p,
                       const double *Hp, double tau, double *phi, double *free,
                       Parts *parts) noexcept:
         """x ← x − αp, g ← g − αHp, and `split`.
 
-        Components within rounding of a bound are set to the bound. Otherwise, rounding
-        could prevent a step of the largest feasible length from reaching the face.
-
-        phi, free : NULL if they are not stored
+        Components within rounding of the boundary are moved to the boundary. Otherwise,
+        rounding could prevent a step of the largest feasible length from reaching it.
         """
-        cdef Py_ssize_t i, o, size
-        cdef double sums[4]
-        if self.has_discs:
-            parts.phi_square = parts.beta_square = parts.reduced_square = 0.0
-            parts.phi_Hp = 0.0
-            for i in range(self.D.ranges):
-                o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
-                advance(alpha, x + o, g + o, p + o, Hp + o, self.lower + o,
-                        self.upper + o, tau, phi + o if phi else NULL,
-                        free + o if free else NULL, size, sums)
-                parts.phi_square += sums[0]
-                parts.beta_square += sums[1]
-                parts.reduced_square += sums[2]
-                parts.phi_Hp += sums[3]
-            advance_discs(&self.D, alpha, x, g, p, Hp, tau, phi, free, &parts.phi_square)
-            return
-        advance(alpha, x, g, p, Hp, self.lower, self.upper_if_any, tau, phi, free,
-                self.n, &parts.phi_square)
-
-    cdef void chop(self, const double *x, const double *g, double *beta) noexcept:
-        """beta ← β, the part of g on the boundary with a feasible direction −β."""
         cdef Py_ssize_t i
-        for i in range(self.n):
-            beta[i] = 0.0
-            if not self.lower[i] < x[i] < self.upper[i] and (
-                (g[i] < 0 and x[i] < self.upper[i])
-                or (g[i] > 0 and x[i] > self.lower[i])
-            ):
-                beta[i] = g[i]
-        if self.D.count:
-            chop_discs(&self.D, x, g, beta)
+        cdef double near, square
+        advance(alpha, x, g, p, Hp, self.lower, self.upper, tau, phi, free, self.n,
+                &parts.phi_square)
+        for i in range(self.n_discs):
+            square, near = self.square_of_disc(i, x), self.radius[i] - 4 * self.slack[i]
+            if (near < 0 or square > near * near) and square > 0:
+                self.scale_disc(i, self.radius[i] / sqrt(square), x)
+        self.split_discs(x, g, tau, phi, free, parts)
 
     cdef void project_gradient(
         self, const double *x, const double *g, double *gP
     ) noexcept:
         """gP ← φ + β."""
-        cdef Py_ssize_t i
+        cdef Py_ssize_t i, j, k
+        cdef double square, inward
         for i in range(self.n):
             gP[i] = g[i]
-            if x[i] <= self.lower[i] and g[i] > 0:
+            if (x[i] <= self.lower[i] and g[i] > 0) or (
+                x[i] >= self.upper[i] and g[i] < 0
+            ):
                 gP[i] = 0.0
-            if x[i] >= self.upper[i] and g[i] < 0:
-                gP[i] = 0.0
-        if self.D.count:
-            project_gradient_on_discs(&self.D, x, gP)
-
-    cdef bint marks(self, const double *x, double *free) noexcept:
-        """free ← 1 off the boundary, else 0; return True if any entry changed."""
-        cdef Py_ssize_t i, j, first, last
-        cdef double inside
-        cdef bint changed = False
-        for i in range(self.D.ranges if self.has_discs else 1):
-            first, last = 0, self.n
-            if self.has_discs:
-                first, last = self.D.range[2 * i], self.D.range[2 * i + 1]
-            for j in range(first, last):
-                if self.has_bound(j):
-                    inside = self.lower[j] < x[j] < self.upper[j]
-                    changed = changed or free[j] != inside
-                    free[j] = inside
-        return mark_discs(&self.D, x, free) or changed
+        for i in range(self.n_discs):
+            square = self.square_of_disc(i, x)
+            if self.is_inside(i, square):
+                continue
+            inward = self.inward_share(i, x, g, square)
+            for k in range(self.start[i], self.start[i + 1]):
+                j = self.index[k]
+                gP[j] -= inward * (x[j] + self.shift[j])
+                if self.radius[i] == 0:
+                    gP[j] = 0.0
 
     cdef void follow(
         self, const double *x, const double *g, const double *v, double *w
@@ -222,102 +216,65 @@ cdef class FeasibleSet:
         """w ← T(w + κv), where T projects onto the tangents of the boundary at x.
 
         Bounds that x attains remain active. A disc also remains active if −g points
-        outwards from its boundary at x. The multiplier κ of this disc adds curvature to
-        the cost along the boundary (discs.h).
+        outwards from its boundary at x. The multiplier κ = −nᵀg/‖x + c‖ of the
+        constraint ½(‖x + c‖² − r²) ≤ 0 adds the curvature of the boundary to the
+        curvature of the cost. On discs of radius zero, w = 0.
 
         v : NULL for zero
         """
-        cdef Py_ssize_t i
+        cdef Py_ssize_t i, j, k
+        cdef double square, share, along
         for i in range(self.n):
-            if not self.lower[i] < x[i] < self.upper[i]:
+            if x[i] <= self.lower[i] or x[i] >= self.upper[i]:
                 w[i] = 0.0
-        tangential_discs(&self.D, x, g, v, w)
+        for i in range(self.n_discs):
+            square, along = self.square_of_disc(i, x), 0.0
+            if self.is_inside(i, square):
+                continue
+            share = self.inward_share(i, x, g, square)
+            if share < 0:
+                for k in range(self.start[i], self.start[i + 1]):
+                    j = self.index[k]
+                    along += (x[j] + self.shift[j]) * w[j] / square
+            for k in range(self.start[i], self.start[i + 1]):
+                j = self.index[k]
+                w[j] -= along * (x[j] + self.shift[j])
+                if v:
+                    w[j] -= share * v[j]
+                if self.radius[i] == 0:
+                    w[j] = 0.0
 
-    cdef void project_free(
-        self, const double *x, const double *g, double tau, double *y
+    # one disc
+
+    cdef inline double square_of_disc(self, Py_ssize_t i, const double *x) noexcept:
+        """Return ‖x + c‖² on disc i."""
+        cdef Py_ssize_t k
+        cdef double u, square = 0.0
+        for k in range(self.start[i], self.start[i + 1]):
+            u = x[self.index[k]] + self.shift[self.index[k]]
+            square += u * u
+        return square
+
+    cdef inline bint is_inside(self, Py_ssize_t i, double square) noexcept:
+        """Return True unless the disc is active; `square` = ‖x + c‖²."""
+        cdef double r = self.radius[i] - self.slack[i]
+        return r > 0 and square < r * r
+
+    cdef inline void scale_disc(
+        self, Py_ssize_t i, double factor, double *x
     ) noexcept:
-        """y ← Π(x − φ/τ), which equals x − φ̃/τ."""
-        cdef Py_ssize_t i
-        projected(x, g, tau, self.lower, self.upper, y, self.n)
-        if self.D.count:
-            self.step_on_discs(x, g, tau, True, y)
-            for i in range(self.D.start[self.D.count]):
-                y[self.D.index[i]] += x[self.D.index[i]]
+        """Multiply x + c by `factor` on disc i."""
+        cdef Py_ssize_t j, k
+        for k in range(self.start[i], self.start[i + 1]):
+            j = self.index[k]
+            x[j] = factor * (x[j] + self.shift[j]) - self.shift[j]
 
-    cdef void step_on_discs(
-        self, const double *x, const double *g, double tau, bint free_only, double *s
+    cdef inline double inward_share(
+        self, Py_ssize_t i, const double *x, const double *g, double square
     ) noexcept:
-        """s ← Π(x − g/τ) − x on discs."""
-        cdef double sums[2]
-        cdef Py_ssize_t i
-        step_on_discs(&self.D, x, g, 1 / tau, free_only, s, sums)
-        for i in range(self.D.start[self.D.count]):
-            s[self.D.index[i]] *= -1
-
-    cdef double step_back(self, const double *x, const double *g, double tau, double *s,
-                          double *square) noexcept:
-        """s ← x − Π(x − g/τ), square ← ‖s‖²; return gᵀs."""
-        cdef double sums[2]
-        cdef Py_ssize_t i, j, first, last
-        sums[:] = [0.0, 0.0]
-        for i in range(self.D.ranges if self.has_discs else 1):
-            first, last = 0, self.n
-            if self.has_discs:
-                first, last = self.D.range[2 * i], self.D.range[2 * i + 1]
-            for j in range(first, last):
-                s[j] = x[j] - fmin(fmax(x[j] - g[j] / tau, self.lower[j]), self.upper[j])
-                sums[0] += g[j] * s[j]
-                sums[1] += s[j] * s[j]
-        if self.D.count:
-            step_on_discs(&self.D, x, g, 1 / tau, False, s, sums)
-        square[0] = sums[1]
-        return sums[0]
-
-    cdef void minimise(self, const double *x, const double *g, double tau, double *s,
-                       double *piece) noexcept:
-        """s ← argmin of gᵀs + τ/2‖s‖² over all s with x + s in the set.
-
-        piece : receives −1 for components at the lower bound, 1 at the upper bound,
-            else 0; may be NULL
-        """
-        model_minimiser(x, g, tau, self.lower, self.upper, s, piece, self.n)
-        if self.D.count:
-            self.step_on_discs(x, g, tau, False, s)
-
-    cdef void minimise_part(
-        self, Py_ssize_t first, Py_ssize_t size, const double *x, const double *g_part,
-        double tau, double *s, double *piece
-    ) noexcept:
-        """Apply `minimise` to a range of components; g_part and piece have its size."""
-        model_minimiser(x + first, g_part, tau, self.lower + first, self.upper + first, s + first,
-               piece, size)
-
-    cdef void leave_box(self, double alpha, double beta, bint release, double *x, double *g,
-                    const double *p, const double *Hp, double *x0, double *g0,
-                    double *free, FeasibleSet face, double *z, double *z_g) noexcept:
-        """Step to the boundary, x ← x − αp; save the old state in x₀, g₀, `free`.
-
-        face : receives the set for the next step, in which components on the boundary
-            are fixed unless `release` is true
-        z, z_g : receive the point x − βp outside the set, with the new x, and the
-            gradient at this point
-        """
-        leave_box(alpha, beta, release, x, g, p, Hp, self.lower, self.upper, x0, g0, free,
-              <double *> face.lower, <double *> face.upper, z, z_g, self.n)
-
-    cdef double minimise_near(
-        self, const double *z, const double *z_g, double tau, const double *x,
-        const double *g, double *s
-    ) noexcept:
-        """s ← z + r − x, where r is the result of `minimise` at z; return gᵀs."""
-        return model_minimiser_within(
-            z, z_g, tau, x, g, self.lower, self.upper, s, self.n
-        )
-
-    cdef double within(self, const double *z, const double *x, const double *g,
-                       bint release, double *s) noexcept:
-        """s ← z + s − x, with x + s set to a bound within rounding of it; return gᵀs.
-
-        s is zero for components that the set fixes, unless `release` is true.
-        """
-        return within(z, x, g, self.lower, self.upper, release, s, self.n)
+        """Return nᵀg/‖x + c‖ for x on the boundary of disc i if nᵀg < 0, else 0."""
+        cdef Py_ssize_t k
+        cdef double push = 0.0
+        for k in range(self.start[i], self.start[i + 1]):
+            push += (x[self.index[k]] + self.shift[self.index[k]]) * g[self.index[k]]
+        return push / square if push < 0 and self.radius[i] > 0 else 0.0

@@ -173,7 +173,7 @@ INLINE int eliminate_all(incomplete *F, Py_ssize_t count, double keep, double le
 
 /* Factorise P_FF with its diagonal multiplied by 1 + shift; return true if all pivots are
    at least `least` times this diagonal. */
-TWICE static int
+CLONED static int
 factorise_incompletely(incomplete *F, in free, double keep, double shift, double least)
 {
     const int *restrict start = F->start, *restrict row = F->row;
@@ -405,11 +405,10 @@ INLINE void backward_column(const incomplete *F, Py_ssize_t j)
     y[j] = rest;
 }
 
-/* z = S M^-1 S v for a v that is zero off the free set; return the dot product of z
-   and `along`. */
-TWICE static double solve_incompletely(const incomplete *F, in v, in along, out z)
+/* z = S M^-1 S v for a v that is zero off the free set. */
+CLONED static void solve_incompletely(const incomplete *F, in v, out z)
 {
-    double *y = F->y, sum = 0;
+    double *y = F->y;
     in s = F->scale;
     memset(z, 0, F->n * sizeof(double));
     if (F->count) {
@@ -431,32 +430,14 @@ TWICE static double solve_incompletely(const incomplete *F, in v, in along, out 
                 backward_column(F, j);
     }
     for (Py_ssize_t r = 0; r < F->runs; r++)
-        for (Py_ssize_t j = F->from[r]; j < F->to[r]; j++) {
+        for (Py_ssize_t j = F->from[r]; j < F->to[r]; j++)
             z[j] = s[j] * y[j];
-            sum += z[j] * along[j];
-        }
-    return sum;
-}
-
-/* s = P(x - z) - x with the projection P onto lower <= x <= upper; return g's. */
-TWICE static double
-projected_step(in x, in z, in g, in lower, in upper, out s, Py_ssize_t n)
-{
-    double slope = 0;
-    for (Py_ssize_t i = 0; i < n; i++) {
-        double to = x[i] - z[i];
-        to = to > lower[i] ? to : lower[i];
-        to = to < upper[i] ? to : upper[i];
-        s[i] = to - x[i];
-        slope += g[i] * s[i];
-    }
-    return slope;
 }
 
 /* Compute the entries of S P S for P stored by rows and a diagonal S, the largest row sum
    of their absolute values, and the smallest row sums of P and of S P S, each relative
    to the diagonal entry. */
-TWICE static void
+CLONED static void
 scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
               Py_ssize_t n, out row_sums)
 {

@@ -273,17 +273,13 @@ cdef class IncompleteFactor:
                 self.shift = fmax(FIRST_SHIFT, SHIFT_GROWTH * self.shift)
         return 0
 
-    cdef double inverse(
-        self, const double *v, const double *along, double *z
-    ) noexcept:
-        """z ← S M⁻¹ S v for a v that is zero off the face; return zᵀ`along`."""
+    cdef void inverse(self, const double *v, double *z) noexcept:
+        """z ← S M⁻¹ S v for a v that is zero off the face."""
         cdef Py_ssize_t i
-        cdef double sum_ = solve_incompletely(&self.F, v, along, z)
+        solve_incompletely(&self.F, v, z)
         self.solves += 1
         for i in range(self.idle):
-            sum_ -= z[self.besides[i]] * along[self.besides[i]]
             z[self.besides[i]] = 0.0
-        return sum_
 
     cdef Py_ssize_t widen(self, double *free, Py_ssize_t count, long layers) noexcept:
         """Add to `free` all components within `layers` edges of `queue` (count,) in the
@@ -307,7 +303,7 @@ cdef class IncompleteFactor:
         result, face = np.empty(self.n), np.asarray(free, dtype=float)
         masked_v = _whole(np.where(free, v, 0.0))
         self.enter(address(face))
-        self.inverse(address(masked_v), address(masked_v), address(result))
+        self.inverse(address(masked_v), address(result))
         return result
 
 

@@ -13,7 +13,7 @@ cdef enum:
 
 @cython.final
 cdef class Model:
-    """B = τI + Uᵀ diag(w) U with the first k rows U (k, n) of an orthonormal basis.
+    """B = τI + Uᵀ diag(w) U with an orthonormal basis U (k, n).
 
     The rows of U are the directions in which H is large, with eigenvalues w + τ, and τ
     bounds H on the complement of these directions. If B ≥ H, then f(x + s) ≤ f(x) + gᵀs
@@ -28,8 +28,7 @@ cdef class Model:
     cdef Py_ssize_t n, k
     cdef Basis basis  # None for B = τI
     cdef Room room
-    cdef double *w  # (k,)
-    cdef double *root  # √w, padded with zeros to a row of `DenseBasis.gram`
+    cdef double *w  # (k,) nonnegative
 
     @staticmethod
     cdef Model of_norm(double norm, Py_ssize_t n):
@@ -38,11 +37,23 @@ cdef class Model:
         B.tau, B.n = norm, n
         return B
 
-    cdef Model with_tail(self, double tau):
-        """Return a model with a new τ and unchanged w + τ; drop rows with w ≤ 0."""
-        if self.basis is None:
-            return Model.of_norm(tau, self.n)
-        return self.basis.model(self.k, self.w, self.tau - tau, tau)
+    @staticmethod
+    cdef Model of(Basis basis, const double *w, double shift, double tau):
+        """Return the model with the weights w + shift; negative weights become zero."""
+        cdef Model B = Model.of_norm(tau, basis.n)
+        cdef Py_ssize_t i
+        B.basis, B.k, B.room = basis, basis.k, Room(basis.k)
+        B.w = B.room.at
+        for i in range(B.k):
+            B.w[i] = fmax(w[i] + shift, 0.0)
+        return B if B.largest() > 0 else Model.of_norm(tau, basis.n)
+
+    cdef double largest(self) noexcept:
+        cdef Py_ssize_t i
+        cdef double most = 0.0
+        for i in range(self.k):
+            most = fmax(most, self.w[i])
+        return most
 
     cdef int step(self, const double *x, const double *g, FeasibleSet box, double *s) except -1:
         """s ← argmin of gᵀs + ½sᵀBs over all s with x + s in the set.
@@ -55,26 +66,26 @@ cdef class Model:
         """
         cdef Basis U = self.basis
         cdef Py_ssize_t i, newton, search, k = self.k
-        cdef double *y
-        cdef double *dy
-        cdef double *there
         cdef double begun, now, low, high, at_low, at_high, t, share
         if U is None:
-            box.minimise(x, g, self.tau, s, NULL)
+            box.minimise(x, g, self.tau, s)
             return 0
-        y, dy, there = U.y, U.dy, U.y_there
-        U.begin(self, x, g, box, s)
+        U.begin(x, g, box)
+        memset(U.y_there, 0, k * sizeof(double))
+        U.minimise_lagrangian(self, x, g, box, s)
+        U.find_slope(self, s)
         for newton in range(NEWTON_STEPS):
+            U.accept()
             U.newton(self)
             for i in range(k):
-                there[i] = y[i] + dy[i]
-            begun = dot(U.slope, dy, k)
+                U.y_there[i] = U.y[i] + U.dy[i]
+            begun = dot(U.slope, U.dy, k)
             U.minimise_lagrangian(self, x, g, box, s)
             if same(U.piece, U.piece_there, U.places):
-                U.finish(self, x, g, box, s)  # the Newton step is exact within a piece
+                U.finish(self, g, s)  # the Newton step is exact within a piece
                 return 0
             U.find_slope(self, s)
-            now = dot(U.slope_there, dy, k)
+            now = dot(U.slope_there, U.dy, k)
             low, high, at_low, at_high, t = 0.0, 1.0, begun, now, 1.0
             for search in range(SEARCH_STEPS):
                 if fabs(now) <= 0.1 * begun or (now > 0 and t == 1) or at_low <= at_high:
@@ -83,33 +94,39 @@ cdef class Model:
                 share = at_low / (at_low - at_high)
                 t = low + (high - low) * fmin(fmax(share, 0.05), 0.95)
                 for i in range(k):
-                    there[i] = y[i] + t * dy[i]
+                    U.y_there[i] = U.y[i] + t * U.dy[i]
                 U.minimise_lagrangian(self, x, g, box, s)
                 U.find_slope(self, s)
-                now = dot(U.slope_there, dy, k)
+                now = dot(U.slope_there, U.dy, k)
                 if now > 0:
                     low, at_low = t, now
                 else:
                     high, at_high = t, now
-            memcpy(y, there, k * sizeof(double))
-            memcpy(U.slope, U.slope_there, k * sizeof(double))
-            memcpy(U.piece, U.piece_there, U.places * sizeof(double))
-        return Model.of_norm(self.tau + U.largest(self), self.n).step(x, g, box, s)
+        return Model.of_norm(self.tau + self.largest(), self.n).step(x, g, box, s)
 
     cdef Model raised(self, const double *s, double square, double sHs):
         """Return the model with τ increased until sᵀBs ≥ sᵀHs, but at most tenfold.
 
-        w + τ is unchanged.
+        w + τ is unchanged, except for rows whose weight becomes zero.
 
         square : ‖s‖²
         """
         cdef double missing = sHs - self.tau * square, rest = square, tau
+        cdef Room Us = Room(self.k)
+        cdef Py_ssize_t i
         if self.basis is not None:
-            self.basis.leave_out(self, s, &missing, &rest)
+            self.basis.times(s, Us.at)
+            for i in range(self.k):
+                if self.w[i] > 0:  # other rows belong to the complement
+                    rest -= Us.at[i] * Us.at[i]
+                missing -= self.w[i] * Us.at[i] * Us.at[i]
         if missing <= 0:
             return self
         tau = self.tau + missing / rest if rest > 0 else INFINITY
-        return self.with_tail(fmin(tau, 10 * self.tau))
+        tau = fmin(tau, 10 * self.tau)
+        if self.basis is None:
+            return Model.of_norm(tau, self.n)
+        return Model.of(self.basis, self.w, self.tau - tau, tau)
 
     cdef int enter(self, const double *free) except -1:
         """Prepare `inverse` for the face whose free components have `free` = 1."""
@@ -117,13 +134,12 @@ cdef class Model:
             self.basis.enter(self, free)
         return 0
 
-    cdef double inverse(self, const double *free, const double *v, const double *along,
-                        double *z) except? -1:
-        """z ← B_FF⁻¹v for a v that is zero off the face F; returns zᵀ`along`."""
+    cdef int inverse(self, const double *free, const double *v, double *z) except -1:
+        """z ← B_FF⁻¹v for a v that is zero off the face F."""
         if self.basis is not None:
-            return self.basis.inverse(self, free, v, along, z)
+            return self.basis.inverse(self, free, v, z)
         copy_scaled(1 / self.tau, v, z, self.n)
-        return dot(z, along, self.n)
+        return 0
 
 
 cdef class Basis:
@@ -141,34 +157,34 @@ cdef class Basis:
     cdef double *y_there
     cdef double *slope
     cdef double *slope_there
-    cdef double *piece
+    cdef double *piece  # (places,) −1 at the lower bound, 1 at the upper, else 0
     cdef double *piece_there
 
-    cdef int make_room(self, Py_ssize_t stride) except -1:
-        """Allocate the vectors of multipliers, of `stride` numbers each."""
-        self.dual = Room(5 * stride + 2 * self.places)
-        self.y, self.dy = self.dual.at, self.dual.at + stride
-        self.y_there, self.slope = self.dy + stride, self.dy + 2 * stride
-        self.slope_there = self.slope + stride
-        self.piece = self.slope_there + stride
-        self.piece_there = self.piece + self.places
+    cdef int make_room(self, Py_ssize_t n, Py_ssize_t k, Py_ssize_t places) except -1:
+        self.n, self.k, self.places = n, k, places
+        self.dual = Room(5 * k + 2 * places)
+        self.y, self.dy = self.dual.at, self.dual.at + k
+        self.y_there, self.slope = self.dy + k, self.dy + 2 * k
+        self.slope_there, self.piece = self.slope + k, self.slope + 2 * k
+        self.piece_there = self.piece + places
         return 0
 
-    cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        """Return a model of the rows i < k with a weight w[i] + shift > 0."""
-        raise NotImplementedError
+    cdef void accept(self) noexcept:
+        """Make the trial point the iterate."""
+        memcpy(self.y, self.y_there, self.k * sizeof(double))
+        memcpy(self.slope, self.slope_there, self.k * sizeof(double))
+        memcpy(self.piece, self.piece_there, self.places * sizeof(double))
 
-    cdef int begin(self, Model B, const double *x, const double *g, FeasibleSet box,
-                   double *s) except -1:
-        """Compute s, `piece` and `slope` for y = 0."""
-        raise NotImplementedError
+    cdef int begin(self, const double *x, const double *g, FeasibleSet box) except -1:
+        """Prepare a step from x with the gradient g."""
+        return 0
 
     cdef int newton(self, Model B) except -1:
         """Compute the Newton step dy from `slope` and `piece`."""
         raise NotImplementedError
 
-    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, FeasibleSet box,
-                  double *s) except -1:
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g,
+                                 FeasibleSet box, double *s) except -1:
         """Compute s(y) and its piece at y = `y_there` for components with bounds."""
         raise NotImplementedError
 
@@ -176,265 +192,134 @@ cdef class Basis:
         """Compute Us(y) − W⁻¹y at y = `y_there`, after `minimise_lagrangian`."""
         raise NotImplementedError
 
-    cdef int finish(self, Model B, const double *x, const double *g, FeasibleSet box,
-                    double *s) except -1:
+    cdef int finish(self, Model B, const double *g, double *s) except -1:
         """Compute s(y) at y = `y_there` for the components without bounds."""
-        raise NotImplementedError
+        return 0
 
-    cdef double largest(self, Model B) except? -1:
-        """Return the largest w."""
-        raise NotImplementedError
-
-    cdef int leave_out(self, Model B, const double *s, double *sBs,
-                       double *square) except -1:
-        """Subtract Σ wᵢ(uᵢᵀs)² from sᵀBs, and ‖Us‖² from ‖s‖²."""
+    cdef int times(self, const double *s, double *c) except -1:
+        """c ← Us."""
         raise NotImplementedError
 
     cdef int enter(self, Model B, const double *free) except -1:
         raise NotImplementedError
 
-    cdef double inverse(self, Model B, const double *free, const double *v,
-                        const double *along, double *z) except? -1:
+    cdef int inverse(self, Model B, const double *free, const double *v,
+                     double *z) except -1:
         raise NotImplementedError
 
 
 @cython.final
 cdef class DenseBasis(Basis):
-    """Rows U (k, n) as an array, with U_F U_Fᵀ for the components F of the last face.
+    """Rows U (k, n) as an array, with U_F U_Fᵀ for the components F of the last face."""
 
-    Only the `size` components from index `first` on can have bounds. All other
-    components are free on every face.
-    """
-
-    cdef Py_ssize_t stride, first, size, flips
-    cdef bint is_split
+    cdef Py_ssize_t flips
     cdef Room room
-    cdef int *where  # (size + 3,)
     cdef double *U
-    cdef double *bounded  # (k, size) columns of U for these components
-    cdef double *columns  # `bounded`, stored by columns (size, stride)
-    cdef double *others  # U_f U_fᵀ of all other components f, stored like `gram`
-    cdef double *gram  # (k, k) upper triangle
-    cdef double *active
-    cdef double *core  # τI + W¹ᐟ² U_F U_Fᵀ W¹ᐟ², factorised
-    cdef double *pivots  # reciprocal pivots of `core`
+    cdef double *gram  # (k, k), lower triangle, as in `core`
+    cdef double *active  # (n,) 1 for components off the last face, else 0
+    cdef double *core  # factor of τI + W¹ᐟ² U_F U_Fᵀ W¹ᐟ², see `solve_cholesky`
     cdef double *c
-    cdef double *fixed
     cdef double *t  # (n,)
 
     @staticmethod
-    cdef DenseBasis zeros(Py_ssize_t k, Py_ssize_t n, Py_ssize_t first, Py_ssize_t size):
+    cdef DenseBasis zeros(Py_ssize_t k, Py_ssize_t n):
         cdef DenseBasis new = DenseBasis.__new__(DenseBasis)
-        cdef Py_ssize_t stride = (k + 3) & ~3
-        new.k, new.n, new.stride, new.first, new.size = k, n, stride, first, size
-        new.places, new.flips = size, size + 1
-        new.room = Room(
-            (k + 1) * n + k * size + stride * (3 * stride + size + 3) + 2 * size + 2
-        )
+        new.make_room(n, k, n)
+        new.flips = n + 1
+        new.room = Room((k + 2) * n + k * (2 * k + 1))
         new.U = new.room.at
-        new.bounded = new.U + k * n
-        new.columns = new.bounded + k * size
-        new.others = new.columns + stride * size
-        new.gram = new.others + stride * stride
-        new.core = new.gram + stride * stride
-        new.pivots = new.core + stride * stride
-        new.c, new.fixed = new.pivots + stride, new.pivots + 2 * stride
-        new.t = new.fixed + stride
+        new.gram, new.core = new.U + k * n, new.U + k * n + k * k
+        new.c, new.t = new.core + k * k, new.core + k * k + k
         new.active = new.t + n
-        new.where = <int *> (new.active + size)
-        new.make_room(stride)
         return new
-
-    cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        # omitted rows are usually the last rows; the basis is then used without a copy
-        cdef Model B = Model.__new__(Model)
-        cdef Py_ssize_t i, kept = 0, last = -1, n = self.n
-        cdef DenseBasis chosen = self
-        for i in range(k):
-            if w[i] + shift > 0:
-                kept, last = kept + 1, i
-        if not kept:
-            return Model.of_norm(tau, self.n)
-        if last >= kept:
-            chosen, kept = DenseBasis.zeros(kept, n, self.first, self.size), 0
-            for i in range(k):
-                if w[i] + shift > 0:
-                    memcpy(chosen.U + kept * n, self.U + i * n, n * sizeof(double))
-                    kept += 1
-        B.room = Room(kept + chosen.stride)
-        B.w, B.root = B.room.at, B.room.at + kept
-        B.basis, B.tau, B.n, B.k, kept = chosen, tau, n, kept, 0
-        for i in range(k):
-            if w[i] + shift > 0:
-                B.w[kept] = w[i] + shift
-                B.root[kept] = sqrt(B.w[kept])
-                kept += 1
-        return B
-
-    cdef void split(self) noexcept:
-        """Copy columns of components that may have bounds, unless already copied."""
-        cdef Py_ssize_t i, j, stride = self.stride
-        if self.is_split:
-            return
-        self.is_split = True
-        for j in range(self.k):
-            memcpy(self.bounded + j * self.size, self.U + j * self.n + self.first,
-                   self.size * sizeof(double))
-        transposed(self.bounded, self.columns, self.k, self.size, stride)
-        if self.size == self.n:
-            return
-        for j in range(self.k):
-            self.others[j * stride + j] = 1.0
-        for i in range(self.size):
-            self.where[i], self.active[i] = i, 1.0
-        self.change(self.size, self.others)
-        for i in range(self.k):
-            for j in range(i):
-                self.others[i * stride + j] = self.others[j * stride + i]
-
-    cdef void change(self, Py_ssize_t count, double *gram) noexcept:
-        """Subtract the components in `where` that became active; add all others."""
-        cdef Py_ssize_t c, q
-        cdef double sign[4]
-        for c in range(0, count, 4):
-            for q in range(4):
-                sign[q] = 0.0
-                if c + q < count:
-                    sign[q] = 1 - 2 * self.active[self.where[c + q]]
-                else:
-                    self.where[c + q] = 0
-            add_gram(sign, self.columns, self.where + c, gram, self.stride)
-
-    cdef void face(self, const double *piece) noexcept:
-        """Update `gram` for the face on which `piece` (size,) is zero.
-
-        Because the rows are orthonormal, gram is I minus the sum over active
-        components. To limit rounding errors, gram is recomputed after as many changes
-        as there are components. The sum is then taken over the active or the free
-        components, whichever are fewer.
-        """
-        cdef Py_ssize_t i, count, stride = self.stride
-        cdef bint sums_active
-        self.split()
-        if self.flips > self.size:
-            self.flips = count = 0
-            for i in range(self.size):
-                count += piece[i] != 0
-            sums_active = 2 * count > self.size
-            memcpy(self.gram, self.others, stride * stride * sizeof(double))
-            if not sums_active:
-                memset(self.gram, 0, stride * stride * sizeof(double))
-                for i in range(self.k):
-                    self.gram[i * stride + i] = 1.0
-            for i in range(self.size):
-                self.active[i] = sums_active
-        count = changed(piece, self.active, self.size, self.where)
-        self.flips += count
-        self.change(count, self.gram)
 
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², F: components with `piece` zero.
 
-        This matrix is bounded below by τI for every W.
+        Because the rows are orthonormal, `gram` is I minus the sum over active
+        components. To limit rounding errors, gram is recomputed after as many changes
+        as there are components. The factorised matrix is bounded below by τI.
         """
-        self.face(piece)
-        scaled(B.root, self.gram, B.tau, self.core, B.k, self.stride)
-        if not eliminated(self.core, self.pivots, B.k, self.stride):
+        cdef Py_ssize_t i, j
+        cdef int k = self.k, n = self.n, info = 0
+        if self.flips > n:
+            self.flips = 0
+            memset(self.active, 0, n * sizeof(double))
+            memset(self.gram, 0, k * k * sizeof(double))
+            for i in range(k):
+                self.gram[i * k + i] = 1.0
+        for i in range(n):
+            if self.active[i] != (piece[i] != 0):
+                add_outer(2 * self.active[i] - 1, self.U + i, n, self.gram, k)
+                self.active[i], self.flips = piece[i] != 0, self.flips + 1
+        for i in range(k):
+            for j in range(i + 1):
+                self.core[i * k + j] = sqrt(B.w[i] * B.w[j]) * self.gram[i * k + j]
+            self.core[i * k + i] += B.tau
+        dpotrf(b"U", &k, self.core, &k, &info)
+        if info:
             raise ArithmeticError("the core of a model is not positive definite")
+        for i in range(k):
+            self.core[i * k + i] = 1 / self.core[i * k + i]
         return 0
 
-    cdef int begin(self, Model B, const double *x, const double *g, FeasibleSet box,
-                   double *s) except -1:
-        cdef Py_ssize_t i, n = self.n, k = B.k
-        self.split()
-        memset(self.y, 0, self.stride * sizeof(double))
-        memset(self.y_there, 0, self.stride * sizeof(double))
-        box.minimise(x, g, B.tau, s, NULL)
-        box.minimise_part(self.first, self.size, x, g + self.first, B.tau, s, self.piece)
-        rows_times(self.U, s, self.slope, k, n)
-        if self.size < n:
-            rows_times(self.bounded, s + self.first, self.fixed, k, self.size)
-            for i in range(k):
-                self.fixed[i] = self.slope[i] - self.fixed[i]
-        return 0
+    cdef void solve(self, Model B, double *y) noexcept:
+        """y ← W¹ᐟ²(τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ²)⁻¹W¹ᐟ² y."""
+        cdef Py_ssize_t i
+        for i in range(self.k):
+            y[i] *= sqrt(B.w[i])
+        solve_cholesky(self.core, y, self.k)
+        for i in range(self.k):
+            y[i] *= sqrt(B.w[i])
 
     cdef int newton(self, Model B) except -1:
-        cdef Py_ssize_t i
         self.factor(B, self.piece)
-        for i in range(B.k):
-            self.dy[i] = B.root[i] * self.slope[i]
-        solve(self.core, self.pivots, self.dy, self.stride)
-        for i in range(B.k):
-            self.dy[i] *= B.root[i] * B.tau
+        copy_scaled(B.tau, self.slope, self.dy, self.k)
+        self.solve(B, self.dy)
         return 0
 
-    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, FeasibleSet box,
-                  double *s) except -1:
-        cdef Py_ssize_t o = self.first
-        combination(1.0, self.bounded, self.y_there, g + o, self.t, B.k, self.size)
-        box.minimise_part(o, self.size, x, self.t, B.tau, s, self.piece_there)
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g,
+                                 FeasibleSet box, double *s) except -1:
+        memcpy(self.t, g, self.n * sizeof(double))
+        add_combination(1.0, self.U, self.y_there, self.t, self.k, self.n)
+        model_minimiser(
+            x, self.t, B.tau, box.lower, box.upper, s, self.piece_there, self.n
+        )
         return 0
 
     cdef int find_slope(self, Model B, const double *s) except -1:
-        # for components without bounds, s = −(g + Uᵀy)/τ; `fixed` is the contribution
-        # of these components to −Ug/τ
         cdef Py_ssize_t i
-        rows_times(self.bounded, s + self.first, self.slope_there, B.k, self.size)
-        for i in range(B.k):
-            self.slope_there[i] -= self.y_there[i] / B.w[i]
-        if self.size < self.n:
-            rows_times(self.others, self.y_there, self.c, B.k, self.stride)
-            for i in range(B.k):
-                self.slope_there[i] += self.fixed[i] - self.c[i] / B.tau
+        rows_times(self.U, s, self.slope_there, self.k, self.n)
+        for i in range(self.k):  # y = 0 without a weight
+            if B.w[i] > 0:
+                self.slope_there[i] -= self.y_there[i] / B.w[i]
         return 0
 
-    cdef int finish(self, Model B, const double *x, const double *g, FeasibleSet box,
-                    double *s) except -1:
-        if self.size < self.n:
-            combination(1.0, self.U, self.y_there, g, self.t, B.k, self.n)
-            box.minimise(x, self.t, B.tau, s, NULL)
-        return 0
-
-    cdef double largest(self, Model B) except? -1:
-        cdef Py_ssize_t i
-        cdef double most = 0.0
-        for i in range(B.k):
-            most = fmax(most, B.w[i])
-        return most
-
-    cdef int leave_out(self, Model B, const double *s, double *sBs,
-                       double *square) except -1:
-        cdef Py_ssize_t i
-        rows_times(self.U, s, self.c, B.k, self.n)
-        for i in range(B.k):
-            square[0] -= self.c[i] * self.c[i]
-            sBs[0] -= B.w[i] * self.c[i] * self.c[i]
+    cdef int times(self, const double *s, double *c) except -1:
+        rows_times(self.U, s, c, self.k, self.n)
         return 0
 
     cdef int enter(self, Model B, const double *free) except -1:
         cdef Py_ssize_t i
-        for i in range(self.size):
-            self.piece[i] = 1 - free[self.first + i]
+        for i in range(self.n):
+            self.piece[i] = 1 - free[i]
         return self.factor(B, self.piece)
 
-    cdef double inverse(self, Model B, const double *free, const double *v,
-                        const double *along, double *z) except? -1:
+    cdef int inverse(self, Model B, const double *free, const double *v,
+                     double *z) except -1:
         # B_FF⁻¹ = (I − U_FᵀW¹ᐟ²(τI + W¹ᐟ²U_FU_FᵀW¹ᐟ²)⁻¹W¹ᐟ²U_F)/τ (Sherman, Morrison
         # and Woodbury)
-        cdef Py_ssize_t i
-        rows_times(self.U, v, self.c, B.k, self.n)
-        for i in range(B.k):
-            self.c[i] *= B.root[i]
-        solve(self.core, self.pivots, self.c, self.stride)
-        for i in range(B.k):
-            self.c[i] *= B.root[i]
-        combination(-1.0, self.U, self.c, v, z, B.k, self.n)
-        return scale_free(1 / B.tau, free, along, z, self.n)
+        rows_times(self.U, v, self.c, self.k, self.n)
+        self.solve(B, self.c)
+        copy_scaled(1 / B.tau, v, z, self.n)
+        add_combination(-1 / B.tau, self.U, self.c, z, self.k, self.n)
+        masked(free, z, z, self.n)
+        return 0
 
 
 @cython.final
 cdef class FactoredBasis(Basis):
-    """Rows C = L⁻¹G with a sparse G and with the weight w of the penalty.
+    """Rows C = L⁻¹G with a sparse G and with one weight w of the penalty.
 
     B = τI + w Gᵀ(GGᵀ)⁻¹G with multipliers y = w(GGᵀ)⁻¹Gs. The gradient of the dual
     function is Gs(y) − GGᵀy/w. Components without bounds have s = −(g + Gᵀy)/τ. For
@@ -459,11 +344,9 @@ cdef class FactoredBasis(Basis):
     @staticmethod
     cdef FactoredBasis of(Rows rows):
         cdef FactoredBasis new = FactoredBasis.__new__(FactoredBasis)
-        cdef Py_ssize_t p
-        new.rows, new.coarse, new.n = rows, rows.coarse, rows.n
-        new.k, new.places = rows.coarse.k, rows.coarse.places
-        p = new.places
-        new.make_room(new.k)
+        cdef Py_ssize_t p = rows.coarse.places
+        new.rows, new.coarse = rows, rows.coarse
+        new.make_room(rows.n, rows.coarse.k, p)
         new.room = Room(6 * p + new.k + new.n)
         new.x_b, new.g_b = new.room.at, new.room.at + p
         new.low_b, new.high_b = new.g_b + p, new.g_b + 2 * p
@@ -472,29 +355,13 @@ cdef class FactoredBasis(Basis):
         new.weights = new.Gg + new.k
         return new
 
-    cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        cdef Model B
-        if w[0] + shift <= 0:
-            return Model.of_norm(tau, self.n)
-        B = Model.__new__(Model)
-        B.basis, B.tau, B.n, B.k, B.room = self, tau, self.n, self.k, Room(1)
-        B.w, B.w[0] = B.room.at, w[0] + shift
-        return B
-
-    cdef int begin(self, Model B, const double *x, const double *g, FeasibleSet box,
-                   double *s) except -1:
+    cdef int begin(self, const double *x, const double *g, FeasibleSet box) except -1:
         cdef Py_ssize_t i, j
         for i in range(self.places):
             j = self.coarse.bounded[i]
             self.x_b[i], self.g_b[i] = x[j], g[j]
             self.low_b[i], self.high_b[i] = box.lower[j], box.upper[j]
         self.coarse.times(g, self.Gg)
-        memset(self.y_there, 0, self.k * sizeof(double))
-        self.minimise_lagrangian(B, x, g, box, s)
-        self.find_slope(B, s)
-        memset(self.y, 0, self.k * sizeof(double))
-        memcpy(self.slope, self.slope_there, self.k * sizeof(double))
-        memcpy(self.piece, self.piece_there, self.places * sizeof(double))
         return 0
 
     cdef int newton(self, Model B) except -1:
@@ -505,8 +372,8 @@ cdef class FactoredBasis(Basis):
         scale(B.tau, self.dy, self.k)
         return 0
 
-    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, FeasibleSet box,
-                  double *s) except -1:
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g,
+                                 FeasibleSet box, double *s) except -1:
         self.coarse.combine_bounded(self.g_b, self.y_there, self.gradient_b)
         model_minimiser(self.x_b, self.gradient_b, B.tau, self.low_b, self.high_b,
                         self.s_b, self.piece_there, self.places)
@@ -523,26 +390,15 @@ cdef class FactoredBasis(Basis):
             self.slope_there[i] -= self.Gg[i] / B.tau + (1 / B.tau + 1 / B.w[0]) * GGy[i]
         return 0
 
-    cdef int finish(self, Model B, const double *x, const double *g, FeasibleSet box,
-                    double *s) except -1:
+    cdef int finish(self, Model B, const double *g, double *s) except -1:
         cdef Py_ssize_t i
         self.coarse.combine(-1 / B.tau, g, -1 / B.tau, self.y_there, s)
         for i in range(self.places):
             s[self.coarse.bounded[i]] = self.s_b[i]
         return 0
 
-    cdef double largest(self, Model B) except? -1:
-        return B.w[0]
-
-    cdef int leave_out(self, Model B, const double *s, double *sBs,
-                       double *square) except -1:
-        cdef Room Cs = Room(self.rows.r)
-        cdef double part
-        self.rows.times(s, Cs.at)
-        part = self.rows.size(Cs.at) ** 2
-        square[0] -= part
-        sBs[0] -= B.w[0] * part
-        return 0
+    cdef int times(self, const double *s, double *c) except -1:
+        return self.rows.times(s, c)
 
     cdef int enter(self, Model B, const double *free) except -1:
         self.coarse.enter(free)
@@ -550,9 +406,9 @@ cdef class FactoredBasis(Basis):
         copy_scaled(1 / B.tau, free, self.weights, self.n)
         return 0
 
-    cdef double inverse(self, Model B, const double *free, const double *v,
-                        const double *along, double *z) except? -1:
+    cdef int inverse(self, Model B, const double *free, const double *v,
+                     double *z) except -1:
         self.coarse.times(v, self.coarse.t)
         self.factor.solve_to(self.coarse.t, self.coarse.y)
         self.coarse.weigh_difference(v, self.coarse.y, self.weights, z)
-        return dot(z, along, self.n)
+        return 0

@@ -213,6 +213,8 @@ cdef class MPRGP:
     cdef Product F
     cdef Py_ssize_t n
     cdef Rows rows
+    cdef const double *lower  # bounds of x, infinite for variables of discs
+    cdef const double *upper
     cdef FeasibleSet set
     cdef FeasibleSet face_set  # feasible set of the step that follows a half step
     cdef double inverse_norm, rho
@@ -241,7 +243,6 @@ cdef class MPRGP:
     cdef Line line  # line of the last product
     cdef Parts parts  # of the gradient at x
     cdef double sums[2]
-    cdef double z_Hp
     cdef double expected_slope  # φᵀz, equal to gᵀp in exact arithmetic
     cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
     cdef double phi_square_at_refresh  # ‖φ‖² at the last `refresh` on this face
@@ -260,8 +261,7 @@ cdef class MPRGP:
     cdef long layers  # number of layers of neighbours released by `step_by_factor`
     cdef Directions directions
     cdef Directions tangents  # directions of CG for a Newton step
-    # (n,) 1 off the boundary, else 0, at the last check of the face
-    cdef double *marked
+    cdef double *marked  # (n,) mask `free` of an earlier face
     cdef long settled  # number of steps on an unchanged face since that check
     cdef long patience  # number of steps before the next Newton step
     cdef double spectral_length  # α of the last step; 0 before the first one
@@ -452,7 +452,7 @@ cdef class MPRGP:
         return 0
 
     cdef const double *preconditioned_gradient(self) except NULL:
-        """Return z, the preconditioned φ on the face; store zᵀHp.
+        """Return z, the preconditioned φ on the face.
 
         With P = B_FF⁻¹ of the model alone, z = Pφ. With a matrix M that approximates
         F⁻¹ without ρQ, z = P(‖𝒫F𝒫‖ M − I)Pφ + Pφ (`solvers.smalbe.preconditioner`).
@@ -467,9 +467,9 @@ cdef class MPRGP:
         if not self.is_preconditioned():
             return self.phi
         if self.factor is not None:
-            self.z_Hp = self.factor.inverse(self.phi, self.Hp, self.z)
+            self.factor.inverse(self.phi, self.z)
             return self.z
-        self.z_Hp = self.preconditioner.inverse(self.free, self.phi, self.Hp, self.z)
+        self.preconditioner.inverse(self.free, self.phi, self.z)
         if self.M is not None:
             self.counts["preconditioner_applies"] += 1
             if self.M_map is not None:
@@ -479,10 +479,9 @@ cdef class MPRGP:
             for i in range(n):
                 rest[i] = self.free[i] * (self.M_scale * Mz[i] - self.z[i])
             if self.rows.exist and self.penalty_of_M() > self.rho:
-                self.z_Hp += weight * (dot(self.phi, self.Hp, n) - self.z_Hp)
                 scale(1 - weight, self.z, n)
                 add(weight, self.phi, self.z, n)
-            self.z_Hp += self.preconditioner.inverse(self.free, rest, self.Hp, Mz)
+            self.preconditioner.inverse(self.free, rest, Mz)
             add(1.0, Mz, self.z, n)
         return self.z
 
@@ -505,7 +504,8 @@ cdef class MPRGP:
             return b"p" if step_by_factor(self) else 0
         if by_model:
             return b"p" if self.step_by_model() else 0
-        self.set.chop(self.x, self.g, beta)
+        self.set.project_gradient(self.x, self.g, beta)
+        add(-1.0, self.phi, beta, self.n)
         self.lengths_along(beta, self.Hs)
         length = fmin(self.line.cg, self.line.feasible)
         if isinf(length):
@@ -541,8 +541,9 @@ cdef class MPRGP:
         replaces s by −s, so that the step is x − αs, and stores the `lengths` of this
         step in `line`. It takes one product.
         """
-        if not negate(s, self.n):
+        if not dot(s, s, self.n):
             return 0
+        scale(-1.0, s, self.n)
         self.lengths_along(s, Hs)
         return fmin(self.line.cg, fmax(1.0, self.line.feasible))
 
@@ -568,11 +569,11 @@ cdef class MPRGP:
         """
         cdef bint is_tested = self.expansion == SPECTRAL and self.spectral_length > 0
         if not begun:
-            self.split()
             self.directions.begin(self.free)
             self.first_direction()
         return is_tested and (
-            self.set.feasible_length(self.x, self.p) < self.spectral_length
+            self.set.feasible_length(self.x, self.p, self.spectral_length)
+            < self.spectral_length
         )
 
     cdef int step_spectrally(self) except -1:
@@ -590,15 +591,13 @@ cdef class MPRGP:
         if not length:
             return 0
         self.record_cost(change_along(&self.line, length))
-        self.to(length, self.s, self.Hs, False)
+        self.to(length, self.s, self.Hs)
         return 1
 
     cdef bint is_settled(self) noexcept:
         """Return True if the face has settled and a Newton step is due."""
-        if self.set.marks(self.x, self.marked):
-            self.settled = 0
-        else:
-            self.settled += 1
+        self.settled = self.settled + 1 if same(self.free, self.marked, self.n) else 0
+        memcpy(self.marked, self.free, self.n * sizeof(double))
         self.patience -= 1
         return self.settled >= SETTLED_FACE and self.patience <= 0
 
@@ -657,9 +656,10 @@ cdef class MPRGP:
         self.sums[0], self.sums[1] = dot(self.g, self.s, n), dot(self.s, self.Hs, n)
         self.line.slope, self.line.curvature = self.sums[0], self.sums[1]
         if change_along(&self.line, 1.0) >= 0:
+            self.split()
             return False
         self.record_cost(change_along(&self.line, 1.0))
-        self.to(1.0, self.s, self.Hs, False)
+        self.to(1.0, self.s, self.Hs)
         if 4 * (self.parts.phi_square + self.parts.beta_square) < before:
             self.patience = 0
         return True
@@ -673,9 +673,12 @@ cdef class MPRGP:
         """
         cdef double square
         cdef Line *line = &self.line
-        line.slope = self.set.step_back(self.x, self.g, tau, self.s, &square)
+        self.set.minimise(self.x, self.g, tau, self.s)
+        scale(-1.0, self.s, self.n)
+        square = dot(self.s, self.s, self.n)
         if not square:
             return 0
+        line.slope = dot(self.g, self.s, self.n)
         self.H(self.s, self.Hs)
         line.curvature = dot(self.s, self.Hs, self.n)
         # gᵀs ≥ τ‖s‖² for projections. At the end of a run, rounding of large normal
@@ -728,7 +731,7 @@ cdef class MPRGP:
         errors remain.
 
         """
-        cdef double length = self.line.cg, curvature = self.line.curvature, z_Hp
+        cdef double length = self.line.cg, curvature = self.line.curvature
         cdef const double *z
         cdef bint knows_Cx = self.knows_Cx
         cdef bint drifts = self.directions.count and (
@@ -752,26 +755,17 @@ cdef class MPRGP:
         # `Cv` contains Cp, which the product Hp has stored
         add(-length, self.Cv, self.Cx, self.rows.r)
         self.knows_Cx = knows_Cx
-        z_Hp = self.parts.phi_Hp
         z = self.preconditioned_gradient()
         if self.directions.count:  # p is one of the stored directions
             memcpy(self.p, z, self.n * sizeof(double))
             self.expected_slope = self.directions.conjugate(self.phi, self.p)
             return 0
-        if z != self.phi:
-            z_Hp = self.z_Hp
-        update_direction(z, z_Hp / curvature, self.p, self.n)
+        update_direction(z, dot(z, self.Hp, self.n) / curvature, self.p, self.n)
         return 0
 
-    cdef void to(
-        self, double alpha, const double *p, const double *Hp, bint stored=True
-    ) noexcept:
-        """x ← x − αp; update the gradient, `parts` and the face without a product.
-
-        stored : false if φ and `free` are not needed
-        """
-        self.set.advance(alpha, self.x, self.g, p, Hp, self.B.tau,
-                         self.phi if stored else NULL, self.free if stored else NULL,
+    cdef void to(self, double alpha, const double *p, const double *Hp) noexcept:
+        """x ← x − αp; update the gradient, `parts` and the face without a product."""
+        self.set.advance(alpha, self.x, self.g, p, Hp, self.B.tau, self.phi, self.free,
                          &self.parts)
         self.knows_Cx = False
 
@@ -802,7 +796,7 @@ cdef class MPRGP:
             self.split()
             return b"e"
         self.to(self.line.feasible, self.p, self.Hp)
-        self.set.project_free(self.x, self.g, self.B.tau, self.x2)
+        self.set.project(self.x, 1 / self.B.tau, self.phi, self.x2)
         memcpy(self.x, self.x2, n * sizeof(double))
         self.gradient(self.x, self.g)
         self.split()
@@ -815,7 +809,7 @@ cdef class MPRGP:
                 dot(self.p, self.p, self.n) / self.line.curvature
             )
         self.record_cost(change_along(&self.line, self.line.feasible))
-        self.to(self.line.feasible, self.p, self.Hp, False)
+        self.to(self.line.feasible, self.p, self.Hp)
         return 1
 
     cdef int trial_of_rule(self, double *y) except -1:
@@ -833,8 +827,8 @@ cdef class MPRGP:
             x[i] = shift[i] + self.x[i]
             x[n + i] = size * self.g[i]
             x[2 * n + i] = size * self.p[i]
-            x[3 * n + i] = shift[i] + self.set.lower[i]
-            x[4 * n + i] = shift[i] + self.set.upper[i]
+            x[3 * n + i] = shift[i] + self.lower[i]
+            x[4 * n + i] = shift[i] + self.upper[i]
         trial = self.step_rule(Step(
             *arrays, self.line.cg * self.inverse_norm,
             self.line.feasible * self.inverse_norm, self.inverse_norm / self.B.tau,
@@ -870,31 +864,38 @@ cdef class MPRGP:
         projection from x for τ ≥ ‖H‖, a gradient projection step from x is taken
         instead.
         """
-        cdef Py_ssize_t n = self.n
+        cdef Py_ssize_t i, n = self.n
         cdef double *s = self.s
         cdef double *Hs = self.Hs
         cdef double *z = self.x2
         cdef double *z_g = self.g2
+        cdef double *low = <double *> self.face_set.lower
+        cdef double *high = <double *> self.face_set.upper
         cdef double cg = self.line.cg, feasible = self.line.feasible, tau = self.B.tau
-        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, slope
+        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, r, noise
         # change of the cost from x
         cdef double change = change_along(&self.line, feasible)
         cdef double least = self.parts.reduced_square / (2 * tau)
         cdef bint is_flat = self.B.basis is None, release = is_first and not is_flat
-        self.set.leave_box(feasible, beyond, release, self.x, self.g, self.p, self.Hp,
-                       self.x0, self.g0, self.free, self.face_set, z, z_g)
+        memcpy(self.x0, self.x, n * sizeof(double))
+        memcpy(self.g0, self.g, n * sizeof(double))
+        memcpy(self.marked, self.free, n * sizeof(double))
+        self.to(feasible, self.p, self.Hp)
+        for i in range(n):
+            low[i] = self.set.lower[i] if release or self.free[i] else self.x[i]
+            high[i] = self.set.upper[i] if release or self.free[i] else self.x[i]
+            z[i] = self.x[i] - beyond * self.p[i]
+            z_g[i] = self.g[i] - beyond * self.Hp[i]
         if beyond and is_flat:
             self.minimise_beyond(most, enough, trace)
-        if is_flat:
-            slope = self.face_set.minimise_near(
-                z, z_g, tau / self.alpha, self.x, self.g, s
-            )
-        else:
-            self.B.tau = tau / self.alpha
-            self.B.step(z, z_g, self.face_set, s)
-            self.B.tau = tau
-            slope = self.face_set.within(z, self.x, self.g, release, s)
-        if slope >= 0:
+        self.B.tau = tau / self.alpha
+        self.B.step(z, z_g, self.face_set, s)
+        self.B.tau = tau
+        for i in range(n):  # from x to z + s; to a bound within rounding of it
+            r, noise = z[i] + s[i], STEP_ROUNDING * (fabs(z[i]) + fabs(s[i]))
+            r = high[i] if high[i] - r <= noise else r
+            s[i] = (low[i] if r - low[i] <= noise else r) - self.x[i]
+        if dot(self.g, s, n) >= 0:
             memcpy(z, self.x, n * sizeof(double))
             memcpy(z_g, self.g, n * sizeof(double))
             self.B.step(self.x, self.g, self.face_set, s)
@@ -905,7 +906,12 @@ cdef class MPRGP:
             if change_along(&self.line, 1.0) + change < 0:
                 length = fmax(length, 1.0)
             change += change_along(&self.line, length)
-            rest_of_step(self.x, self.g, s, Hs, z_g, z, n, self.sums)
+            self.sums[0] = self.sums[1] = 0.0
+            for i in range(n):  # the rest r of the step beyond z, and rᵀHr
+                r = self.x[i] - s[i] - z[i]
+                self.sums[0] += r * r
+                self.sums[1] += r * (self.g[i] - Hs[i] - z_g[i])
+                z[i] = r
             self.B = self.B.raised(z, self.sums[0], self.sums[1])
             self.to(length, s, Hs)
         else:
@@ -915,7 +921,7 @@ cdef class MPRGP:
         return b"e"
 
     cdef int minimise_beyond(self, long most, double enough, bytearray trace) except -1:
-        """Continue CG from z on the face without its bounds.
+        """Continue CG from z on the face `marked` without its bounds.
 
         enough : ‖φ‖² at which CG stops, the value of ‖φ‖² when the face was entered
         most : largest number of steps: the number of CG steps on this face, but at
@@ -923,34 +929,24 @@ cdef class MPRGP:
         """
         cdef Py_ssize_t n = self.n
         cdef long step
-        cdef double curvature = dot(self.p, self.Hp, n), slope
-        advance_freely(0.0, self.x2, self.g2, self.p, self.Hp, self.free, n, self.sums)
-        for step in range(most):
-            if self.sums[0] <= enough:
+        cdef double curvature = dot(self.p, self.Hp, n), length = 0.0
+        cdef double *z = self.phi
+        for step in range(most + 1):
+            add(-length, self.p, self.x2, n)
+            add(-length, self.Hp, self.g2, n)
+            masked(self.marked, self.g2, self.phi, n)
+            if step == most or dot(self.phi, self.phi, n) <= enough:
                 break
             if self.factor is not None:
-                masked(self.free, self.g2, self.phi, n)
-                self.sums[1] = self.factor.inverse(self.phi, self.Hp, self.t)
-            self.update_direction_beyond(self.sums[1] / curvature)
-            slope, curvature = self.sums[0], self.sums[1]
+                z = self.t
+                self.factor.inverse(self.phi, z)
+            update_direction(z, dot(z, self.Hp, n) / curvature, self.p, n)
+            self.H(self.p, self.Hp)
             trace.append(c'b')
+            curvature = dot(self.p, self.Hp, n)
             if curvature <= 0:
                 break
-            advance_freely(slope / curvature, self.x2, self.g2, self.p, self.Hp,
-                           self.free, n, self.sums)
-        return 0
-
-    cdef int update_direction_beyond(self, double gamma) except -1:
-        """p ← φ − γp at z, Hp ← H p, `sums` ← φᵀp and pᵀHp; one product."""
-        if self.factor is not None:
-            update_direction(self.t, gamma, self.p, self.n)
-            self.H(self.p, self.Hp)
-            self.sums[0] = dot(self.phi, self.p, self.n)
-            self.sums[1] = dot(self.p, self.Hp, self.n)
-            return 0
-        self.sums[0] = update_free_direction(self.g2, self.free, gamma, self.p, self.n)
-        self.H(self.p, self.Hp)
-        self.sums[1] = dot(self.p, self.Hp, self.n)
+            length = dot(self.phi, self.p, n) / curvature
         return 0
 
     cdef int project_gradient(self, double tau) except -1:
@@ -959,8 +955,8 @@ cdef class MPRGP:
         cdef double length
         memcpy(self.x, self.x0, n * sizeof(double))
         memcpy(self.g, self.g0, n * sizeof(double))
-        self.set.project_free(self.x, self.g, tau, self.s)
-        add(-1.0, self.x, self.s, n)
+        self.split()
+        self.set.minimise(self.x, self.phi, tau, self.s)
         length = self.searched(self.s, self.Hs)
         if length == 0 or isinf(length):
             return 0

@@ -107,13 +107,6 @@ cdef int copy_result(
 # --- products -----------------------------------------------------------------------
 
 
-cdef enum:
-    # Smallest number of unknowns for which products with a dense P use BLAS. At this
-    # size, the triangle of 1.4 MB no longer fits into the caches of one core, so that
-    # memory bandwidth limits BLAS and our kernel equally.
-    BLAS_SIZE = 600
-
-
 @cython.final
 cdef class Product:
     """The operator v ↦ Pv with a counter of its products."""
@@ -173,9 +166,7 @@ cdef class Product:
         self.count += 1
         cdef int n = self.n, one = 1
         cdef double zero = 0.0
-        if self.dense and self.n < BLAS_SIZE:
-            symmetric_product(self.dense, s, v, y, self.n)
-        elif self.dense:
+        if self.dense:
             dsymv(b"L", &n, &s, <double *> self.dense, &n, <double *> v, &one, &zero,
                   y, &one)
         elif self.rows.data:
@@ -243,23 +234,18 @@ cdef class Rows:
         self, double s, const double *a, const double *v, double *y
     ) except -1:
         """y ← v + s Cᵀa; y may be v."""
+        if y != v:
+            memcpy(y, v, self.n * sizeof(double))
         if self.C:
-            combination(s, self.C, a, v, y, self.r, self.n)
+            add_combination(s, self.C, a, y, self.r, self.n)
         elif self.exist:
             self.coarse.backward(a, self.coarse.y)
-            self.coarse.combine(1.0, v, s, self.coarse.y, y)
-        elif y != v:
-            memcpy(y, v, self.n * sizeof(double))
+            self.coarse.combine(1.0, y, s, self.coarse.y, y)
         return 0
 
     cdef int add(self, double s, const double *a, double *y) except -1:
         """y ← y + s Cᵀa."""
-        cdef Py_ssize_t i
-        if not self.C:
-            return self.combine(s, a, y, y)
-        for i in range(self.r):
-            add(s * a[i], self.C + i * self.n, y, self.n)
-        return 0
+        return self.combine(s, a, y, y)
 
     cdef int project(self, double *v, double *Cv) except -1:
         """v ← v − CᵀCv; Cv receives the product with the old v."""

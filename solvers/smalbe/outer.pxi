@@ -74,11 +74,10 @@ cdef class SMALBE(MPRGP):
         self.owners, self.rows = [], problem.C
         self.b, self.q = read(problem.b, self.owners), read(problem.q, self.owners)
         lower, upper = read(bounds[0], self.owners), read(bounds[1], self.owners)
+        self.lower, self.upper = lower, upper
         self.set = FeasibleSet.of(lower, upper, self.n)
         if problem.discs:
-            self.set.add_discs(
-                problem.discs, self.rows.x_tilde if self.rows.exist else NULL
-            )
+            self.set.add_discs(problem.discs, self.rows.x_tilde)
         if len(problem.diagonal):
             self.diagonal = read(problem.diagonal, self.owners)
         self.alpha, self.Gamma_square = options.alpha, options.Gamma
@@ -128,7 +127,6 @@ cdef class SMALBE(MPRGP):
         many subdomains, for which the spectrum is flat.
         """
         cdef Py_ssize_t i, n_directions, kept = 0, n = self.n, r = self.rows.r
-        cdef Py_ssize_t first = 0, last = n
         cdef const double *value = NULL
         cdef const double *residual = NULL
         cdef DenseBasis basis
@@ -144,56 +142,46 @@ cdef class SMALBE(MPRGP):
             if residual[0] > RITZ_RESIDUAL * value[0]:
                 kept = 0
             self.tail = fmax((value[kept] + residual[kept]) / self.norm, MIN_TAIL)
-        if not self.rows.C:
-            self.n_directions, self.above = 1, Room(1)
-            self.above.at[0] = -self.tail
-            if self.rows.exist:
-                self.basis = FactoredBasis.of(self.rows)
-            return 0
-        self.n_directions = kept + r
+        self.n_directions = r if self.rows.coarse is not None else kept + r
         self.above = Room(self.n_directions)
         for i in range(self.n_directions):
             self.above.at[i] = -self.tail
             if i >= r:
                 self.above.at[i] += (value[i - r] + residual[i - r]) / self.norm
-        if not self.n_directions:
-            return 0
-        while first < n and not self.set.has_bound(first) and not self.set.has_discs:
-            first += 1
-        while last > first and not self.set.has_bound(last - 1) and not self.set.has_discs:
-            last -= 1
-        basis = DenseBasis.zeros(self.n_directions, n, first, last - first)
-        memcpy(basis.U, self.rows.C, r * n * sizeof(double))
-        if kept:
-            memcpy(basis.U + r * n, read(ritz.vectors, owners), kept * n * sizeof(double))
-        # share one copy, so that it stays in the cache
-        self.basis, self.rows.C = basis, basis.U
-        self.rows.owners.append(basis)
+        if self.rows.coarse is not None:
+            self.basis = FactoredBasis.of(self.rows)
+        elif self.n_directions:
+            basis = DenseBasis.zeros(self.n_directions, n)
+            memcpy(basis.U, self.rows.C, r * n * sizeof(double))
+            if kept:
+                memcpy(basis.U + r * n, read(ritz.vectors, owners), kept * n * sizeof(double))
+            # share one copy, so that it stays in the cache
+            self.basis, self.rows.C = basis, basis.U
+            self.rows.owners.append(basis)
         return 0
 
     cdef Model model(self, double rho):
         """Return the model of H with the Ritz pairs and the penalty ρ."""
-        cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
+        cdef Py_ssize_t i
         cdef Room w
         if self.basis is None:
             return Model.of_norm(self.tail, self.n)
         if self.cached_model is None or self.cached_rho != rho:
             w = Room(self.n_directions)
             for i in range(self.n_directions):
-                w.at[i] = self.above.at[i] + (rho if i < of_rows else 0.0)
-            self.cached_model = self.basis.model(self.n_directions, w.at, 0.0, self.tail)
-            self.cached_rho = rho
+                w.at[i] = self.above.at[i] + (rho if i < self.rows.r else 0.0)
+            self.cached_model, self.cached_rho = Model.of(self.basis, w.at, 0.0, self.tail), rho
         return self.cached_model
 
     cdef Model model_of_penalty(self, double rho):
         """Return the model I + (ρ − 1)Q of H, without Ritz pairs; I for ρ < 1."""
-        cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
-        cdef Room w = Room(of_rows)
+        cdef Py_ssize_t i
+        cdef Room w = Room(self.n_directions)
         if not self.rows.exist:
             return Model.of_norm(1.0, self.n)
-        for i in range(of_rows):
+        for i in range(self.rows.r):
             w.at[i] = rho - 1
-        return self.basis.model(of_rows, w.at, 0.0, 1.0)
+        return Model.of(self.basis, w.at, 0.0, 1.0)
 
     cdef int choose_models(self) except -1:
         """Choose the model B and the preconditioner for the present ρ."""
@@ -229,8 +217,8 @@ cdef class SMALBE(MPRGP):
         free, phi, beta = np.empty(self.n), np.empty(self.n), np.empty(self.n)
         self.set.split(read(x, owners), read(g, owners), self.B.tau, address(phi),
                        address(free), &parts)
-        self.set.chop(read(x, owners), read(g, owners), address(beta))
-        return free, phi, beta
+        self.set.project_gradient(read(x, owners), read(g, owners), address(beta))
+        return free, phi, beta - phi
 
     # the start
 
@@ -470,10 +458,9 @@ cdef class SMALBE(MPRGP):
         cdef double *v = address(moved)
         cdef double *free = self.x2
         cdef double *t = self.t
+        cdef Parts parts
         memcpy(v, read(nu, owners), n * sizeof(double))
-        for i in range(n):
-            free[i] = 1.0
-        self.set.marks(v, free)
+        self.set.split(v, v, 1.0, t, free, &parts)
         for _ in range(ALTERNATIONS):
             self.rows.times(v, self.Cv)
             memset(t, 0, n * sizeof(double))
@@ -511,8 +498,15 @@ cdef class SMALBE(MPRGP):
         cdef double *free = self.x2
         cdef double *t = self.t
         cdef double *da = self.Cv
-        restored(v, self.rows.x_tilde, self.set.lower, self.set.upper,
-                 read(lb, owners), read(ub, owners), x, free, n)
+        cdef const double *least = read(lb, owners)
+        cdef const double *most = read(ub, owners)
+        for i in range(n):  # x̃ + ν may differ from a bound in the last bit
+            x[i] = fmin(fmax(self.rows.x_tilde[i] + v[i], least[i]), most[i])
+            if v[i] >= self.upper[i]:
+                x[i] = most[i]
+            if v[i] <= self.lower[i]:
+                x[i] = least[i]
+            free[i] = self.lower[i] < v[i] < self.upper[i]
         self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
@@ -546,5 +540,9 @@ cdef class SMALBE(MPRGP):
                 a[i] -= da[i]
             add_combination(-1.0, C, da, rest, r, n)
         if any_left:  # otherwise x is the unconstrained minimiser
-            bound_multipliers(v, self.set.lower, self.set.upper, rest, z_box, n)
+            for i in range(n):
+                if v[i] <= self.lower[i]:
+                    z_box[i] = -fmax(rest[i], 0.0)
+                if v[i] >= self.upper[i]:
+                    z_box[i] -= fmin(rest[i], 0.0)
         return restored_x, multipliers, boxes, product

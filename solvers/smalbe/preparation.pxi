@@ -70,113 +70,6 @@ def orthonormal(G, e):
 cdef double RANK = 1e-13
 
 
-def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
-    """Return y (m,) with Gᵀy = Cᵀa, from the QR factorisation of the normalised rows.
-
-    triangle, rows_kept, sizes, shares : R (r, r), the indices of independent rows (r,),
-        the norms of all rows (m,), and a (r,)
-    """
-    cdef Py_ssize_t i, j, r = len(triangle)
-    cdef double s
-    result = np.zeros(m)
-    cdef double *y = address(result)
-    cdef const double *R = address(triangle)
-    cdef const double *size = address(sizes)
-    cdef const double *a = address(shares)
-    cdef const int[::1] kept = rows_kept
-    for i in range(r - 1, -1, -1):  # Rz = a, y = z/size
-        s = a[i]
-        for j in range(i + 1, r):
-            s -= R[i * r + j] * y[kept[j]] * size[kept[j]]
-        y[kept[i]] = s / (R[i * r + i] * size[kept[i]])
-    return result
-
-
-cdef enum:
-    # largest number of QR steps per eigenvalue; convergence is cubic, and two steps
-    # usually suffice
-    QR_STEPS = 30
-
-
-cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept nogil:
-    """Compute the eigenpairs of a symmetric tridiagonal matrix (k, k), sorted.
-
-    The algorithm takes QR steps with Wilkinson's shift (Golub and Van Loan, Matrix
-    Computations, 4th ed., Algorithm 8.3.3). For k = 6, LAPACK's `dstev` takes 1.3 µs,
-    which is twice as long as this function, and as long as four products with 73
-    unknowns.
-
-    diagonal : (k,) receives the eigenvalues
-    off : (k − 1,) off-diagonal entries, overwritten
-    S : (k, k) receives the eigenvectors by rows
-    """
-    cdef int first, last, i, j, step
-    cdef double x, z, c, s, r, a, b, d, half, top, most = 0.0
-    memset(S, 0, k * k * sizeof(double))
-    for i in range(k):
-        S[i * k + i] = 1.0
-        most = fmax(most, fabs(diagonal[i]))
-        most = fmax(most, fabs(off[i]) if i + 1 < k else 0.0)
-    if not 0 < most < INFINITY:
-        return
-    for i in range(k):  # scale, so that squares neither overflow nor underflow
-        diagonal[i] /= most
-    for i in range(k - 1):
-        off[i] /= most
-    for last in range(k - 1, 0, -1):
-        for step in range(QR_STEPS):
-            first = last
-            while first > 0 and fabs(off[first - 1]) > 2.0 ** -52 * (
-                fabs(diagonal[first - 1]) + fabs(diagonal[first])
-            ):
-                first -= 1
-            if first == last:
-                break
-            half, z = (diagonal[last - 1] - diagonal[last]) / 2, off[last - 1]
-            r = sqrt(half * half + z * z)
-            x = diagonal[first] - diagonal[last] + z * z / (half + (r if half > 0 else -r))
-            z = off[first]
-            for i in range(first, last):  # chase the entry outside the three diagonals
-                r = sqrt(x * x + z * z)
-                c, s = (x / r, z / r) if r > 0 else (1.0, 0.0)
-                if i > first:
-                    off[i - 1] = r
-                a, b, d = diagonal[i], off[i], diagonal[i + 1]
-                top = c * (c * a + s * b) + s * (c * b + s * d)
-                diagonal[i], diagonal[i + 1] = top, a + d - top
-                x = off[i] = c * (c * b + s * d) - s * (c * a + s * b)
-                if i + 1 < last:
-                    z = s * off[i + 1]
-                    off[i + 1] *= c
-                for j in range(k):
-                    a = S[i * k + j]
-                    S[i * k + j] = c * a + s * S[(i + 1) * k + j]
-                    S[(i + 1) * k + j] = c * S[(i + 1) * k + j] - s * a
-    for last in range(k - 1, 0, -1):
-        i = last
-        for j in range(last):
-            i = j if diagonal[j] > diagonal[i] else i
-        if i != last:
-            diagonal[i], diagonal[last] = diagonal[last], diagonal[i]
-            for j in range(k):
-                a = S[i * k + j]
-                S[i * k + j], S[last * k + j] = S[last * k + j], a
-    for i in range(k):
-        diagonal[i] *= most
-
-
-def eigenpairs(diagonal, off):
-    """Return ascending eigenvalues (k,) and eigenvectors (k, k), as rows, of a matrix.
-
-    diagonal, off : (k,) and (k − 1,) entries of a symmetric tridiagonal matrix
-    """
-    k = len(diagonal)
-    values, rest = np.array(diagonal, dtype=float), np.array([*off, 0.0])
-    vectors = matrix(k, k)
-    diagonalise(address(values), address(rest), address(vectors), k)
-    return values, vectors
-
-
 def lanczos(Product F, Rows C, start, int steps):
     """Compute upper Ritz pairs of 𝒫F𝒫 from `start` (n,); return the fields of `Ritz`.
 
@@ -189,9 +82,9 @@ def lanczos(Product F, Rows C, start, int steps):
     C : rows that span the kernel of 𝒫
     """
     cdef Py_ssize_t i, k, n = F.n
-    cdef int kept = 0
+    cdef int kept = 0, info = 0
     steps = min(steps, n - len(C.source.C))
-    cdef Room room = Room((steps + 2) * n + C.r + (steps + 3) * steps)
+    cdef Room room = Room((steps + 2) * n + C.r + (steps + 4) * steps)
     cdef double *basis = room.at
     cdef double *v = basis + steps * n
     cdef double *Fv = v + n
@@ -199,7 +92,7 @@ def lanczos(Product F, Rows C, start, int steps):
     cdef double *diagonal = Cv + C.r
     cdef double *off = diagonal + steps
     cdef double *share = off + steps
-    cdef double *S = share + steps  # (kept, kept) by rows
+    cdef double *S = share + 2 * steps  # (kept, kept) by rows
     cdef double *value
     cdef double *residual
     cdef double *vector
@@ -232,7 +125,7 @@ def lanczos(Product F, Rows C, start, int steps):
         return zeros(1), zeros(1), np.zeros((1, n)), 0.0
     at_start = diagonal[0]
     beta = off[kept - 1]
-    diagonalise(diagonal, off, S, kept)
+    dstev(b"V", &kept, diagonal, off, S, &kept, share, &info)
     values, residuals = empty(kept), empty(kept)
     value, residual = address(values), address(residuals)
     for i in range(kept):  # descending values

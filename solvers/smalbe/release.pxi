@@ -7,7 +7,7 @@ cdef double gain_of_projection(MPRGP at) noexcept:
     With the projection Π onto the set, s = Π(x − g/τ) − x and τ ≥ ‖H‖, the bound is
     −gᵀs/2, because gᵀs ≤ −τ‖s‖².
     """
-    at.set.minimise(at.x, at.g, at.B.tau, at.s, NULL)
+    at.set.minimise(at.x, at.g, at.B.tau, at.s)
     return -0.5 * dot(at.g, at.s, at.n)
 
 
@@ -36,7 +36,8 @@ cdef bint step_by_factor(MPRGP at) except -1:
     cdef double *beta = at.t
     cdef double least = gain_of_projection(at), length
     memcpy(wide, at.free, n * sizeof(double))
-    at.set.chop(at.x, at.g, beta)
+    at.set.project_gradient(at.x, at.g, beta)
+    add(-1.0, at.phi, beta, n)
     for i in range(n):
         if beta[i] != 0:
             wide[i], factor.queue[count] = 1.0, <int> i
@@ -45,8 +46,9 @@ cdef bint step_by_factor(MPRGP at) except -1:
     count = factor.widen(wide, count, at.layers)
     factor.enter(wide)
     masked(wide, at.g, at.phi, n)
-    factor.inverse(at.phi, at.g, at.z)
-    if projected_step(at.x, at.z, at.g, at.set.lower, at.set.upper, at.s, n) < 0:
+    factor.inverse(at.phi, at.z)
+    at.set.minimise(at.x, at.z, 1.0, at.s)
+    if dot(at.g, at.s, n) < 0:
         length = at.searched(at.s, at.Hs)
         if isinf(length):
             return 0

@@ -20,11 +20,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtrs
 from scipy.sparse import csc_array, csr_array, diags_array, issparse
 
 from mortarbench.harness import Matrix, Vector, too_large
@@ -275,7 +276,14 @@ def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
         return _no_rows(G.shape[1])
     rows, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e, float))
     dense, C, GC, e_size, least_pivot, x_tilde, consistent = rows
-    multipliers = partial(compiled.multipliers, e.size, *triangle)
+    R, kept, sizes = triangle
+
+    def multipliers(a: Vector) -> Vector:
+        y = np.zeros(e.size)
+        if a.size:
+            y[kept] = dtrtrs(R, a)[0] / sizes[kept]
+        return y
+
     return DenseRows(
         dense, C, e_size, least_pivot, x_tilde, consistent, multipliers, GC
     )

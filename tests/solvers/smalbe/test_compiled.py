@@ -138,37 +138,6 @@ def test_the_preparation_projects_and_normalises(seed):
     assert qp.A.T @ problem.rows.multipliers(a) == pytest.approx(C.T @ a, abs=1e-7)
 
 
-@pytest.mark.parametrize("kind", ["random", "graded", "split", "equal", "huge", "tiny"])
-@pytest.mark.parametrize("k", [1, 2, 3, 5, 6, 12])
-@pytest.mark.parametrize("count", [5, pytest.param(50, marks=pytest.mark.slow)])
-def test_eigenpairs_of_tridiagonal_matrices_are_accurate_and_ascending(count, k, kind):
-    """Among the matrices, some are graded over 16 orders of magnitude, decoupled by
-    zeros, or scaled by 1e200 or 1e-200.
-    """
-    rng = np.random.default_rng([k, len(kind)])
-    for _ in range(count):
-        d, e = rng.standard_normal(k), rng.standard_normal(max(k - 1, 0))
-        if kind == "graded":
-            d, e = d * 10 ** rng.uniform(-8, 8, k), e * 10 ** rng.uniform(-8, 8, k - 1)
-        elif kind == "split":
-            e[rng.random(k - 1) < 0.5] = 0
-        elif kind == "equal":
-            d[:] = d[0]
-        size = {"huge": 1e200, "tiny": 1e-200}.get(kind, 1.0)
-        values, vectors = compiled.eigenpairs(size * d, size * e)
-        T = np.diag(d) + np.diag(e, 1) + np.diag(e, -1)
-        most, values = np.abs(np.linalg.eigvalsh(T)).max(), values / size
-
-        assert (np.diff(values) >= 0).all()
-        assert vectors @ vectors.T == pytest.approx(np.eye(k), abs=1e-13)
-        assert vectors @ T == pytest.approx(values[:, None] * vectors, abs=1e-13 * most)
-
-
-def test_eigenpairs_of_zero_and_nan_matrices_terminate():
-    assert (compiled.eigenpairs(np.zeros(3), np.zeros(2))[0] == 0).all()
-    assert not np.isfinite(compiled.eigenpairs([1.0, np.nan], [1.0])[0]).all()
-
-
 @pytest.mark.parametrize("kind", ["dense", "sparse", "operator"])
 @pytest.mark.parametrize("seed", seeds(4, 12))
 def test_answers_agree_with_the_textbook(seed, kind):
