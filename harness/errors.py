@@ -65,6 +65,11 @@ def one_line(message: str) -> str:
     return shortened(" ".join(message.splitlines()), MAX_MESSAGE)
 
 
+def described(e: BaseException) -> str:
+    """Return the type and the message of an exception as one line."""
+    return " ".join(f"{type(e).__name__}: {e}".split())
+
+
 #: Hint after the list of known solvers or families in an error message.
 PLUGINS = "; others come with --plugin FILE.py"
 

@@ -22,7 +22,14 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 from mortarbench.harness.checked import located
-from mortarbench.harness.errors import PLUGINS, InputError, shortened, shown, unknown
+from mortarbench.harness.errors import (
+    PLUGINS,
+    InputError,
+    described,
+    shortened,
+    shown,
+    unknown,
+)
 from mortarbench.harness.keys import Value, keys_of
 from mortarbench.harness.plugin import Case, Family, Reference
 
@@ -244,7 +251,7 @@ def unbuilt(name: object, e: BaseException) -> str:
         case MemoryError():
             why = "it needs more memory than is available"
         case _:
-            why = f"{type(e).__name__}: {e}"
+            why = described(e)
     return " ".join(f"{name} could not be built: {why}".split())
 
 

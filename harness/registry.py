@@ -38,7 +38,7 @@ import msgspec
 
 from mortarbench.harness.checked import located
 from mortarbench.harness.digest import hex_digest, pieces
-from mortarbench.harness.errors import PLUGINS, InputError, shown, unknown
+from mortarbench.harness.errors import PLUGINS, InputError, described, shown, unknown
 from mortarbench.harness.keys import keys_of
 from mortarbench.harness.plugin import Family, Solver
 
@@ -503,7 +503,7 @@ def _with_options(
     try:
         configured: Solver = replace(solver, **changes)
     except (TypeError, ValueError) as e:  # raised by the solver's check of its options
-        raise InputError(f"{spec.name}: {_one_line(e)}") from None
+        raise InputError(f"{spec.name}: {' '.join(str(e).split())}") from None
     return configured
 
 
@@ -571,12 +571,8 @@ def _no_file(plugin_file: PluginFile) -> InputError:
 
 def _import_error(where: str, e: BaseException) -> InputError:
     prefix = f"{where}: " if where else ""
-    return InputError(f"{prefix}failed to import: {_type(e)}: {_one_line(e)}")
+    return InputError(f"{prefix}failed to import: {described(e)}")
 
 
 def _type(thing: object) -> str:
     return type(thing).__name__
-
-
-def _one_line(e: BaseException) -> str:
-    return " ".join(str(e).split())

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
@@ -47,20 +47,9 @@ TURN = ForkSafeLock()
 Plugins = Annotated[Sequence[str | Path | PluginFile], "--plugin [LABEL=]FILE.py"]
 
 
-class Reporter(Protocol):
-    """Function that writes a report and returns its files and main sentences."""
-
-    def __call__(
-        self,
-        folder: Path,
-        formats: Sequence[str],
-        *,
-        factor: float = ...,
-    ) -> tuple[list[Path], list[str]]:
-        """Write the report.
-
-        factor : a point is verified if every residual is at most factor·tol
-        """
+#: function that writes a report on a folder in several formats, with the argument
+#: `factor`, and returns its files and main sentences; see `mortarbench.report`
+Reporter: TypeAlias = Callable[..., tuple[list[Path], list[str]]]
 
 
 def _plugin_files(files: Plugins) -> list[PluginFile]:

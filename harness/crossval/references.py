@@ -25,7 +25,7 @@ from mortarbench.harness.verify.active_set_refinement import (
 )
 from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
-from mortarbench.harness.verify.substructured import Undivided
+from mortarbench.harness.verify.substructured import Split
 
 
 class UnsolvedError(Exception):
@@ -59,7 +59,7 @@ def reference_point(mechanics: Mechanics, solve: Reference) -> ReferencePoint:
     mechanics = mechanics.whole
     u, lam, active = exchanged(mechanics, _identified(mechanics, solve))
     try:
-        certificate = proof(Undivided(mechanics), u, u, lam, active.closed)
+        certificate = proof(Split(mechanics), u, u, lam, active.closed)
     except UncertifiableError as e:
         raise UnsolvedError(
             f"the reference solve found no admissible pair: {e}"

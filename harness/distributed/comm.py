@@ -27,6 +27,8 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mortarbench.harness.errors import described
+
 T = TypeVar("T")
 
 PEER_TIMEOUT = 5.0  #: longest time for which a failed rank waits for the other ranks, s
@@ -155,7 +157,7 @@ class _MPIComm(Comm):
             failure = e
         message = np.zeros(_MESSAGE_BYTES, dtype=np.uint8)
         if failure is not None:
-            text = in_a_line(failure).encode()[:_MESSAGE_BYTES]
+            text = described(failure).encode()[:_MESSAGE_BYTES]
             message[: len(text)] = np.frombuffer(text, dtype=np.uint8)
         messages = np.empty((self.size, _MESSAGE_BYTES), dtype=np.uint8)
         request = self._outcomes.Iallgather(message, messages)
@@ -205,7 +207,7 @@ class _MPIComm(Comm):
         return tuple(order)
 
     def abort(self, failure: BaseException) -> NoReturn:
-        line = self._named(self.rank, in_a_line(failure))
+        line = self._named(self.rank, described(failure))
         with suppress(OSError, KeyError):  # a single write does not interleave
             os.write(int(os.environ[RECORD]), f"{line}\n".encode())
         with suppress(OSError, ValueError):  # a solver may have closed stderr
@@ -283,8 +285,3 @@ def led(comm: Comm, served: Any, work: Callable[[], T]) -> T:
     if isinstance(result, Exception):
         raise result
     return result  # type: ignore[no-any-return]
-
-
-def in_a_line(failure: BaseException) -> str:
-    """Return the type and the message of an exception as one line."""
-    return " ".join(f"{type(failure).__name__}: {failure}".split())

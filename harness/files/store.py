@@ -26,14 +26,9 @@ Arrays = Mapping[str, NDArray[Any]]
 
 _DIGEST = re.compile("[0-9a-f]{16}")
 POINT = ("x", "y", "z", "z_box")
-_ALWAYS = ("points", "cells", "bodies", "displacement")
-_OPTIONAL = ("contact_nodes", "contact_forces", "subdomains")
 _NODAL = "nodal_"
 #: prefix of the names of the arrays of a contact side, with the number of the side
 _SIDE = "side_{}_"
-_ALONG = ("nodes", "length", "force", "pressure", "gap")
-#: optional arrays of a contact side
-_SOME = ("push", "shear", "friction", "friction_force", "exact")
 _HISTORY = "history_"
 
 
@@ -64,20 +59,13 @@ def load_history(folder: Path, digest: str) -> History:
         return _history(path, arrays)
 
 
-def save_fields(folder: Path, fields: Fields) -> str:
-    """Store a deformed state and return its digest."""
-    return save(folder, field_arrays(fields))
-
-
 def field_arrays(fields: Fields) -> Arrays:
     """Return the arrays of a deformed state by name."""
-    arrays = {name: getattr(fields, name) for name in _ALWAYS + _OPTIONAL}
-    arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
-    for i, side in enumerate(fields.contacts):
-        arrays |= {
-            _SIDE.format(i) + name: getattr(side, name)
-            for name in ("name", *_ALONG, *_SOME)
-        }
+    arrays = {**vars(fields)}
+    nodal, sides = arrays.pop("nodal"), arrays.pop("contacts")
+    arrays |= {_NODAL + name: values for name, values in nodal.items()}
+    for i, side in enumerate(sides):
+        arrays |= {_SIDE.format(i) + name: v for name, v in vars(side).items()}
     return {k: np.asarray(v) for k, v in arrays.items() if v is not None}
 
 
@@ -91,23 +79,15 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
     """
     with _restorable():
-        _, arrays = _as_stored(folder, digest, _ALWAYS)
+        _, arrays = _as_stored(folder, digest, ("points", "displacement"))
+    sides: list[ContactSide] = []
+    side: dict[str, Any]
+    while side := _with_prefix(_SIDE.format(len(sides)), arrays):
+        side["name"] = str(side["name"])
+        sides.append(ContactSide(**side))
+    known = {k: v for k, v in arrays.items() if not k.startswith((_NODAL, "side_"))}
     nodal = _with_prefix(_NODAL, arrays)
-    known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
-    return Fields(nodal=nodal, contacts=tuple(_sides(arrays)), **known)
-
-
-def _sides(arrays: Arrays) -> Iterator[ContactSide]:
-    """Yield the contact sides of a deformed state; old files contain no sides."""
-    for i in range(len(arrays)):
-        side = _with_prefix(_SIDE.format(i), arrays)
-        if not set(side) >= {"name", *_ALONG}:
-            return
-        yield ContactSide(
-            name=str(side["name"]),
-            **{name: side[name] for name in _ALONG},
-            **{name: side[name] for name in _SOME if name in side},
-        )
+    return Fields(nodal=nodal, contacts=tuple(sides), **known)
 
 
 def write_point(path: Path, solution: Solution) -> None:

@@ -29,7 +29,7 @@ from contextlib import suppress
 from enum import StrEnum
 from typing import Any
 
-from mortarbench.harness.errors import one_line, shortened
+from mortarbench.harness.errors import described, one_line, shortened
 from mortarbench.harness.record import Record, finite
 
 #: size of the largest reply that is read, which bounds the required memory
@@ -68,7 +68,7 @@ def answer_requests(
                 sys.stdout.flush()  # the next request truncates the log
             except Exception as e:  # fault of the harness, not of a solver
                 traceback.print_exc()
-                send("fault", what=one_line(f"{type(e).__name__}: {e}"))
+                send("fault", what=one_line(described(e)))
             else:
                 send("warm" if "warm_up" in request else "done", **reply)
 

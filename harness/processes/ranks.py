@@ -30,12 +30,11 @@ from mortarbench.harness.distributed.comm import (
     Comm,
     Lead,
     RankFailedError,
-    in_a_line,
     world,
 )
 from mortarbench.harness.distributed.mpi import MISSING, mpiexec
 from mortarbench.harness.environment.cpus import fastest_first
-from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import InputError, described
 from mortarbench.harness.plugin import Case, CaseOnRanks, Solver
 from mortarbench.harness.processes import parent
 from mortarbench.harness.qp import QP
@@ -134,7 +133,7 @@ class Ranks:
         except (InputError, RankFailedError) as e:  # all ranks raise the same error
             self.failure = e
         except Exception as e:
-            self.failure = RankFailedError(in_a_line(e))
+            self.failure = RankFailedError(described(e))
         else:
             self.served, self._case = built.served, built.case
 

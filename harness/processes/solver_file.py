@@ -20,7 +20,7 @@ from site import getsitepackages, getusersitepackages
 from types import ModuleType
 from typing import Any
 
-from mortarbench.harness.errors import InputError, one_line
+from mortarbench.harness.errors import InputError, described, one_line
 from mortarbench.harness.plugin import Solver
 
 
@@ -66,9 +66,8 @@ def read_solver(path: Path) -> Any:
     try:
         return pickle.loads(path.read_bytes())
     except Exception as e:  # raised by a __setstate__, or by an imported module
-        reason = f"{type(e).__name__}: {e}"
         raise InputError(
-            f"the solver cannot be rebuilt in a worker process: {one_line(reason)}; "
+            f"the solver cannot be rebuilt in a worker process: {described(e)}; "
             "expected its name and plugins=[FILE.py]"
         ) from None
 

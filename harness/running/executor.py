@@ -9,7 +9,7 @@ from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mortarbench.harness.errors import FaultError
+from mortarbench.harness.errors import FaultError, described
 from mortarbench.harness.files.durable import refuse_full_disk, report_full_disk
 from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
@@ -101,9 +101,7 @@ class Executor:
                         yield result
                 return
             except (FaultError, OSError) as e:
-                reason = " ".join(str(e).split())
-                if not isinstance(e, FaultError):
-                    reason = f"{type(e).__name__}: {reason}"
+                reason = str(e) if isinstance(e, FaultError) else described(e)
                 refuse_full_disk(self.scratch, reason)
             label = turn[0].solver
             # build again, since a lost or damaged file may be the cause

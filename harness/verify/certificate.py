@@ -92,7 +92,6 @@ from mortarbench.harness.verify.substructured import (
     Rounding,
     Split,
     Subdomains,
-    Undivided,
     length,
     neighbour,
 )
@@ -316,15 +315,16 @@ def certify_pair(
     """
     if not (np.isfinite(claimed).all() and np.isfinite(multipliers).all()):
         raise UncertifiableError("the answer contains NaN or inf")
-    split = Undivided(bodies) if isinstance(bodies, Mechanics) else Subdomains(bodies)
+    split = Split(bodies) if isinstance(bodies, Mechanics) else Subdomains(bodies)
     outcomes = list(_certificates(split, claimed, multipliers))
     certificates = [c for c in outcomes if isinstance(c, Certificate)]
     if not certificates:
         raise UncertifiableError(f"no admissible pair near the answer: {outcomes[0]}")
     best = min(certificates, key=lambda c: c.error)
-    if isinstance(split, Subdomains) or split.bodies.lift.any() or best.bound <= 1:
+    whole = split.undivided
+    if whole is None or whole.lift.any() or best.bound <= 1:
         return best
-    return replace(best, least=max(best.least, _least_norm(split)))
+    return replace(best, least=max(best.least, _least_norm(whole)))
 
 
 def _certificates(
@@ -344,11 +344,11 @@ def _certificates(
     if not bounds:
         yield _proved(split, claimed, 0 * split.exact.f, 0 * lam, none)
     elif (
-        isinstance(split, Undivided)
+        split.undivided is not None
         and split.motions.all.shape[1]
         and SHARP_BOUND < min(bounds) <= MAX_EXCHANGE_BOUND
     ):
-        v, mu, active = exchanged(split.bodies, active, EXCHANGE_ROUNDS)
+        v, mu, active = exchanged(split.undivided, active, EXCHANGE_ROUNDS)
         yield _proved(split, claimed, v, mu, active.closed)
 
 
@@ -360,13 +360,13 @@ def _proved(split: Split, *pair: Any) -> Certificate | str:
         return str(e)
 
 
-def _least_norm(split: Undivided) -> float:
+def _least_norm(mechanics: Mechanics) -> float:
     """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer.
 
     The bound is 0 if the pair is not admissible.
     """
-    u, lam, active = exchanged(split.bodies, unconstrained_guess(split.bodies))
-    found = _proved(split, u, u, lam, active.closed)
+    u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
+    found = _proved(Split(mechanics), u, u, lam, active.closed)
     return found.least if isinstance(found, Certificate) else 0.0
 
 
@@ -478,9 +478,9 @@ def _evaluated(
     )
     if not np.isfinite(certificate.error):
         raise UncertifiableError("the answer is too large: its energy overflows")
-    if isinstance(split, Undivided) and split.bodies.lift.any():
+    if (undivided := split.undivided) is not None and undivided.lift.any():
         # errors are relative to u* + w, and ‖u* + w‖ ≥ ‖û + w‖ − ‖û − u*‖
-        whole = split.bodies.norm(u + split.bodies.lift)
+        whole = undivided.norm(u + undivided.lift)
         return replace(certificate, least=whole - certificate.error, norm=whole)
     return certificate
 

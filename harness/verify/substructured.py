@@ -13,7 +13,7 @@ the stored K. The other is a solution d of
     TᵀK_T d = ρ                                                                  (5)
 
 in double precision; the residual of d is evaluated in extended precision. An undivided
-body is a single subdomain with eliminated supports: T = I and d = K⁺ρ (`Undivided`).
+body is a single subdomain with eliminated supports: T = I and d = K⁺ρ (`Split`).
 For decomposed bodies (`Subdomains`), ρ is distributed over the subdomains as in
 balancing domain decomposition (Mandel 1993). The forces b with Tᵀb = ρ are in
 equilibrium on every subdomain, R_Tᵀb = 0, where the columns of R_T are the rigid
@@ -33,7 +33,6 @@ answer are not used.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -107,39 +106,52 @@ class Neighbour(NamedTuple):
     unbalanced: Extended  #: (r,)  Rᵀ(ρ − TᵀK_T d)
 
 
-class Split(ABC):
+class Split:
     """Operations of the certificate with K = TᵀK_T T + E.
 
     Vectors (n,) of components have extended precision and are zero on fixed components;
     vectors (N,) contain the copies of components in all subdomains. Columns of R are
     the rigid motions that the supports allow; the first p columns change gaps or slip.
+    This class is that of undivided bodies: T = I, and K_T = PKP with P = I − RRᵀ.
     """
 
-    precision: Any  #: type of numbers in which the products of `noise` are rounded
+    precision: Any = (
+        Real  #: type of numbers in which the products of `noise` are rounded
+    )
 
     def __init__(self, bodies: Mechanics | DecomposedMechanics) -> None:
+        #: the bodies, unless they are decomposed
+        self.undivided = bodies if isinstance(bodies, Mechanics) else None
         self.bodies = bodies
         self.exact, self.motions = bodies.exact, bodies.motions
 
-    @abstractmethod
+    @cached_property
+    def _stiffness(self) -> csc_array:
+        assert self.undivided is not None
+        return csc_array(self.undivided.primal.P)
+
     def spread(self, u: Extended) -> Extended:
         """Return the copies Tu (N,) of u (n,)."""
+        return u
 
-    @abstractmethod
     def joined(self, b: Extended) -> Extended:
-        """Return the sums Tᵀb (n,) over the copies of each component."""
+        """Return the sums Tᵀb (n,) over copies, with zeros on fixed components."""
+        return self.free(b.copy())
 
-    @abstractmethod
     def product(self, v: Extended) -> Extended:
         """Return K_T v (N,)."""
+        Kv = in_precision(self._stiffness, Real) @ self.motions.without(v)
+        return self.motions.without(Kv)
 
-    @abstractmethod
     def solve(self, rho: Extended) -> Vector:
         """Return a solution d (N,) of (5) in double precision, for ρ with Rᵀρ = 0."""
+        assert self.undivided is not None
+        return np.asarray(self.undivided.apply_inverse(rho), dtype=np.float64)
 
-    @abstractmethod
     def variances(self, u: Extended) -> Vector:
-        """Return sums (n,) of the squared terms of Ku."""
+        """Return sums (n,) of the squared terms of Ku, without those of KR."""
+        deformed = self.motions.without(u).astype(np.float64)
+        return np.asarray(self._stiffness.power(2) @ deformed**2)
 
     def averaged(self, v: Extended) -> Extended:
         """Return averages (n,) of the copies v (N,), which may be moved rigidly."""
@@ -151,12 +163,17 @@ class Split(ABC):
         deformed : (n,) displacement without rigid motion
         square : its energy in K_T
         """
-        del deformed, square
         return 0.0
 
-    @abstractmethod
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Bound E along combinations `supported` (p, h) of the first p columns of R."""
+        """Bound E along combinations `supported` (p, h) of the first p columns of R.
+
+        For undivided bodies, ER is KR up to the projection P.
+        """
+        R, KR = self.motions.constrained, self.motions.KR
+        along = np.abs(supported.T @ np.asarray(R.T @ KR) @ supported)
+        strain = [length(self, KR @ k) for k in supported.T]
+        return Rounding(np.array(strain), along.astype(np.float64))
 
     def free(self, v: Extended) -> Extended:
         """Set v (n,) to zero on fixed components, in place."""
@@ -262,44 +279,8 @@ def sample(variances: Vector, u: Extended, precision: Any) -> Extended:
     return np.asarray((units + SMOOTH_ULPS * np.sign(u)) * sizes)
 
 
-class Undivided(Split):
-    """Undivided bodies: T = I, and K_T = PKP with P = I − RRᵀ."""
-
-    bodies: Mechanics
-    precision = Real
-
-    def spread(self, u: Extended) -> Extended:
-        """Return u."""
-        return u
-
-    def joined(self, b: Extended) -> Extended:
-        """Return b with zeros on fixed components."""
-        return self.free(b.copy())
-
-    def product(self, v: Extended) -> Extended:
-        """Apply PKP with P = I − RRᵀ."""
-        K, v = csc_array(self.bodies.primal.P), self.motions.without(v)
-        return self.motions.without(in_precision(K, Real) @ v)
-
-    def solve(self, rho: Extended) -> Vector:
-        """Return K⁺ρ."""
-        return np.asarray(self.bodies.apply_inverse(rho), dtype=np.float64)
-
-    def variances(self, u: Extended) -> Vector:
-        """Return (K∘K)(v∘v) for v = u − RRᵀu, since KR is known."""
-        K = csc_array(self.bodies.primal.P).power(2)
-        return np.asarray(K @ self.motions.without(u).astype(np.float64) ** 2)
-
-    def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Return bounds on ER, which is KR up to the projection P."""
-        R, KR = self.motions.constrained, self.motions.KR
-        along = np.abs(supported.T @ np.asarray(R.T @ KR) @ supported)
-        strain = [length(self, KR @ k) for k in supported.T]
-        return Rounding(np.array(strain), along.astype(np.float64))
-
-
 class Subdomains(Split):
-    """Decomposed bodies, with E sampled in double precision.
+    """Operations for decomposed bodies, with E sampled in double precision.
 
     Residuals are evaluated with TᵀK_T T and the exact kernels of the subdomains. The
     matrix Z of the module docstring acts only on interfaces and fixed components: for a

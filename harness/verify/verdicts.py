@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.errors import described
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Case
 from mortarbench.harness.qp import QP
@@ -224,7 +225,7 @@ def has_point(s: Solution) -> bool:
 
 def note_of(what: str, e: Exception) -> str:
     """Return a one-line note that an exception prevented the computation of `what`."""
-    return " ".join(f"no {what}: {type(e).__name__}: {e}".split())
+    return f"no {what}: {described(e)}"
 
 
 def noted(record: Record, *notes: str) -> Record:

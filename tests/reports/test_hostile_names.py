@@ -126,9 +126,10 @@ IN_CSV = {
     "bell\x07 null\x00 escape\x1b[31m return\r\nnew\u2028line\u0085":
         r"bell\x07 null\x00 escape\x1b[31m return\r\nnew\u2028line\x85",
     "lone \ud800 surrogate": r"lone \ud800 surrogate",
-    "+1": "'+1", "-1": "'-1", "@SUM(1)": "'@SUM(1)", "\t=1+1": r"'\t=1+1",
-    "\r=1": r"'\r=1", " =1": "' =1", "\uff1d1": "'\uff1d1", "\u200b=1": "'\u200b=1",
-    "1;=1": "1;=1",
+    "+1": "'+1", "-1": "'-1", "@SUM(1)": "'@SUM(1)", "\t=1+1": r"\t=1+1",
+    "\r=1": r"\r=1", " =1": "' =1", "\uff1d1": "'\uff1d1", "\u200b=1": r"\u200b=1",
+    "1;=1": "1;=1", "zero\u200bwidth\u200d\ufeff\u00ad":
+        "zero\\u200bwidth\u200d\\ufeff\\xad",
 }  # fmt: skip
 
 

@@ -6,9 +6,10 @@ import pytest
 
 from mortarbench.harness import Fields, InputError, Solution, Status
 from mortarbench.harness.files.store import (
+    field_arrays,
     load_fields,
     load_solution,
-    save_fields,
+    save,
 )
 from tests.support.stored import save_solution
 
@@ -86,7 +87,7 @@ def test_every_vector_its_name_and_its_shape_are_part_of_the_digest(tmp_path, so
 
 
 def test_a_deformed_state_comes_back_with_its_nodal_fields(tmp_path, fields):
-    loaded = load_fields(tmp_path, save_fields(tmp_path, fields))
+    loaded = load_fields(tmp_path, save(tmp_path, field_arrays(fields)))
 
     assert loaded.contact_nodes is None
     assert loaded.cells.dtype == fields.cells.dtype
@@ -101,7 +102,7 @@ def test_contact_forces_are_restored_if_present(tmp_path, fields):
         displacement=fields.displacement, contact_nodes=np.array([3]),
         contact_forces=np.array([[0.0, -5.0]]),
     )  # fmt: skip
-    loaded = load_fields(tmp_path, save_fields(tmp_path, with_contact))
+    loaded = load_fields(tmp_path, save(tmp_path, field_arrays(with_contact)))
 
     np.testing.assert_array_equal(loaded.contact_nodes, [3])
     np.testing.assert_array_equal(loaded.contact_forces, [[0.0, -5.0]])

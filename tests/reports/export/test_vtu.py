@@ -11,7 +11,7 @@ import pytest
 from mortarbench.cli.main import main
 from mortarbench.harness import ContactSide, Fields, InputError
 from mortarbench.harness.files.qpfile import save_qp
-from mortarbench.harness.files.store import load_fields, save_fields
+from mortarbench.harness.files.store import field_arrays, load_fields, save
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
@@ -76,7 +76,7 @@ def test_a_family_states_the_subdomain_of_every_cell(name, is_torn, tmp_path):
     case = parse(name, PROBLEMS).build(reference_solution)
     answer = SOLVERS["smalbe"].prepare(case.qp, 1e-6)()
     fields = case.fields(answer)
-    stored = load_fields(tmp_path, save_fields(tmp_path, fields))
+    stored = load_fields(tmp_path, save(tmp_path, field_arrays(fields)))
     if not is_torn:
         assert fields.subdomains is None
         assert stored.subdomains is None
