@@ -81,10 +81,8 @@ def load_fields(folder: Path, digest: str) -> Fields:
     with _restorable():
         _, arrays = _as_stored(folder, digest, ("points", "displacement"))
     sides: list[ContactSide] = []
-    side: dict[str, Any]
     while side := _with_prefix(_SIDE.format(len(sides)), arrays):
-        side["name"] = str(side["name"])
-        sides.append(ContactSide(**side))
+        sides.append(ContactSide(name=str(side.pop("name")), **side))
     known = {k: v for k, v in arrays.items() if not k.startswith((_NODAL, "side_"))}
     nodal = _with_prefix(_NODAL, arrays)
     return Fields(nodal=nodal, contacts=tuple(sides), **known)

@@ -73,7 +73,7 @@ ELSEWHERE = {
     "mortarbench replay out/sizes SESSION-RUN_ID": "the same",
     "mortarbench run ranks": "test_ranks.py, a smaller suite of ranks",
     "mortarbench run fleet --dask tcp://login1:8786": "test_cluster.py",
-    "mortarbench run fleet --dask tls://login1:8786": "test_cluster_tls.py",
+    "mortarbench run fleet --dask tls://login1:8786": "test_cluster.py",
     "gmsh -2 -order 1 press.geo": "gmsh is not installed; its output is in tests/data",
 }
 #: files that programs outside of the test environment would write, by page

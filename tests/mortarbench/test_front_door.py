@@ -95,24 +95,6 @@ def test_options_are_passed_on_and_history_can_be_switched_off():
         mb.solve(case, "smalbe", options={"max_step": 3})
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: mb.build("beam-rin/dual"), "did you mean 'beam-ring'"),
-        (lambda: mb.build("beam-ring/Nr=0/dual"), "Nr=0 must be at least 1"),
-        (lambda: mb.solve(SMALL, "smalb"), "did you mean 'smalbe'"),
-        (lambda: mb.solve(SMALL, "smalbe", tol=2), "tol = 2; expected a number bet"),
-        (lambda: mb.run("dem"), "did you mean 'demo'"),
-        (lambda: mb.load("nowhere"), "nowhere"),
-        (lambda: mb.report("nowhere", formats=["htm"]), "did you mean 'html'"),
-    ],
-)
-def test_errors_are_reported_in_one_line(call, message):
-    with pytest.raises(mb.InputError, match=message) as e:
-        call()
-    assert "\n" not in str(e.value)
-
-
 def test_a_run_is_a_table_of_its_journal(results, capfd):
     records = read_journal(results.folder)
 

@@ -7,18 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mortarbench.cli.main import main
 from mortarbench.harness import Record, Status, Verdict
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.verify.kkt import Residuals, rejudged, verdict
-from mortarbench.problems import PROBLEMS
-from mortarbench.registries import Registries
 from mortarbench.reports.folder import write_report
 from mortarbench.reports.measurements import read_measurements
 from mortarbench.reports.sections import compose
-from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.reference.solve import reference_solution
 
 sizes = st.one_of(
     st.floats(0, 1, allow_nan=False),
@@ -135,36 +130,3 @@ def test_the_journal_and_its_table_keep_the_status_as_stored(folder):
 
     assert pd.read_parquet(folder / "report/records.parquet").status[0] == "verified"
     assert read_journal(folder)[0].status is Verdict.VERIFIED
-
-
-def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch):
-    """The run yields verified, declined and other verdicts, which are recomputed from
-    the claims and residuals of the journal.
-    """
-    monkeypatch.chdir(tmp_path)
-    bench = Registries(
-        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda *_, **__: ([], []),
-    )  # fmt: skip
-    (tmp_path / "s.toml").write_text(
-        'name = "s"\ntolerances = [1e-3, 1e-8]\nrepeats = 1\ntime_limit = 60\n'
-        'solvers = ["smalbe", "clarabel", '
-        '{ name = "osqp", label = "few", options = { max_iter = 20 } }]\n'
-        '[[problems]]\nfamily = "beam-ring"\nforms = ["primal", "dual"]\n'
-        "params = { Nr = 2, Nh = 1, steps = 1 }\n"
-    )
-    assert main(bench, ["run", "s.toml", "--out", "out"]) == 0
-    records = read_journal(tmp_path / "out")
-    found = {
-        verdict(
-            Status(r.claimed),
-            Residuals(*(np.inf if v is None else v for v in
-                        (r.primal, r.dual, r.complementarity, r.gap))),
-            r.tol,
-        )
-        is r.status
-        for r in records
-    }  # fmt: skip
-
-    assert found == {True}
-    assert {Verdict.VERIFIED, Verdict.DECLINED} < {r.status for r in records}

@@ -255,7 +255,13 @@ def test_a_cluster_without_workers_ends_the_run_which_the_same_command_continues
 
 def test_an_address_without_a_scheduler_is_reported_in_one_line(cli, monkeypatch):
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
-    for address in ("tcp://127.0.0.1:9", "nonsense://x", "ucx://x", ""):
+    for address in (
+        "tcp://127.0.0.1:9",
+        "tls://127.0.0.1:9",
+        "nonsense://x",
+        "ucx://x",
+        "",
+    ):
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
         assert code == 2
         assert err.splitlines()[-1].startswith(f"mortarbench: --dask {address}:")
