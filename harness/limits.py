@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 
 from mortarbench.harness.errors import InputError, shown
 
@@ -17,6 +18,7 @@ CASE_VARIABLE = "MORTARBENCH_CASE_MIB"
 #: Environment variable with the memory limit of a suite, in MiB, which is set for the
 #: workers of the suite.
 VARIABLE = "MORTARBENCH_MEMORY_MIB"
+_MAX_MIB = 1e12
 
 
 def memory_limit_mib() -> float:
@@ -26,7 +28,12 @@ def memory_limit_mib() -> float:
 
 
 def case_limit_mib() -> float:
-    """Return the memory limit for building a case, in MiB.
+    """Return the memory limit for building a case, in MiB."""
+    return limit_of(CASE_VARIABLE, _machine_mib())
+
+
+def limit_of(variable: str, default: float) -> float:
+    """Return the limit that an environment variable sets, in MiB.
 
     Raises
     ------
@@ -34,19 +41,13 @@ def case_limit_mib() -> float:
         If the environment variable is set to a value that is not a positive number.
 
     """
-    text = os.environ.get(CASE_VARIABLE)
-    if text is None:
-        return _machine_mib()
-    try:
-        limit = float(text)
-    except ValueError:
-        limit = 0.0
-    if not limit > 0:
-        raise InputError(
-            f"{CASE_VARIABLE} = {shown(text)}; expected a positive number of MiB, such "
-            "as 65536"
-        )
-    return limit
+    text = os.environ.get(variable, str(default))
+    with suppress(ValueError):
+        if 0 < float(text) <= _MAX_MIB:
+            return float(text)
+    raise InputError(
+        f"{variable} = {shown(text)}; expected a positive number of MiB, such as 65536"
+    )
 
 
 def _machine_mib() -> float:

@@ -21,8 +21,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mortarbench.harness.digest import hex_digest, pieces
-from mortarbench.harness.errors import InputError, shortened
+from mortarbench.harness.errors import InputError
 from mortarbench.harness.files import reading
+from mortarbench.harness.limits import limit_of
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
 DEFAULT_MIB = 2048
@@ -33,24 +34,8 @@ _PARSER_BYTES = 256 * MIB  #: memory that a parser may use in addition to the da
 
 
 def max_bytes() -> int:
-    """Return the memory limit for a data file, in bytes.
-
-    Raises
-    ------
-    InputError
-        If the environment variable is not a positive integer.
-
-    """
-    text = os.environ.get(VARIABLE, str(DEFAULT_MIB))
-    try:
-        most = int(text)
-    except ValueError:
-        most = 0
-    if most < 1:
-        raise InputError(
-            f"{VARIABLE} = {shortened(text)!r}; expected a positive number of MiB"
-        )
-    return most * MIB
+    """Return the memory limit for a data file, in bytes; see `limit_of` for errors."""
+    return int(limit_of(VARIABLE, DEFAULT_MIB) * MIB)
 
 
 def check_size(what: str, size: int) -> None:

@@ -2,7 +2,8 @@
 
 All measurements of all folders are kept unchanged. Session and run_id identify a
 measurement; if two folders contain the same measurement, for example because both are
-merges of a third folder, its line is written once.
+merges of a third folder, its line is written once. The suite is that of the first
+folder.
 
 The journal of the new folder is written last, in a single step. A folder without a
 journal contains no measurements, so the same command can be given again if a merge was
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.files.durable import replace_file, report_full_disk
+from mortarbench.harness.files.reading import read_text
 from mortarbench.harness.files.store import copy_stored
 from mortarbench.harness.record import Record
 from mortarbench.harness.results.folder import (
@@ -27,8 +29,8 @@ from mortarbench.harness.results.folder import (
     write_json,
 )
 from mortarbench.harness.results.journal import read_journal, refuse_other_solver
-from mortarbench.harness.suite.growth import unite
-from mortarbench.harness.suite.suite import as_toml, read_stored
+from mortarbench.harness.suite.growth import refuse_unequal
+from mortarbench.harness.suite.suite import read_stored
 
 
 def merge(
@@ -76,9 +78,11 @@ def merge(
         )
     folders = [*[out] * journal.exists(), *journals]
     _check_labels({f: journals.get(f) or read_journal(f) for f in folders})
-    paths = {str(folder): folder / "suite.toml" for folder in folders}
-    suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
-    suite = as_toml(unite(suites)) if suites else ""
+    paths = [path for f in folders if (path := f / "suite.toml").exists()]
+    suites = [read_stored(path) for path in paths]
+    for path, suite_file in zip(paths, suites, strict=True):
+        refuse_unequal(str(paths[0]), suites[0], str(path), suite_file)
+    suite = read_text(paths[0]) if paths else ""
     with report_full_disk(out), lock_folder(out):
         merged = _united(
             {

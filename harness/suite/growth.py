@@ -1,24 +1,19 @@
-"""Settings that all measurements of a result folder share, and unions of suites.
+"""Settings of suites that all measurements of a result folder share.
 
 A suite that has a result folder may be extended: solvers, cases, tolerances and repeats
 may be added. Stored measurements depend on the limits, the accuracy and the steps of
-sequences, which must not change. Suites with equal settings can be united.
+sequences, which must not change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-import msgspec
+from collections.abc import Sequence
 
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.suite.suite import SuiteFile
 
 #: settings that must not change, since stored verdicts and times depend on them
 FIXED_KEYS = ("time_limit", "memory_limit", "accuracy")
-
-_AND = "-and-"  #: separator of the names of united suites
 
 
 def refuse_changed(old: SuiteFile, new: SuiteFile, where: str) -> None:
@@ -35,7 +30,7 @@ def refuse_changed(old: SuiteFile, new: SuiteFile, where: str) -> None:
         If the name, a fixed setting or a sequence has changed.
 
     """
-    _refuse_unequal(where, old, "the suite", new, ("name", *FIXED_KEYS))
+    refuse_unequal(where, old, "the suite", new, ("name", *FIXED_KEYS))
     for problem in old.problems:
         if problem.sequence is not None and problem not in new.problems:
             raise InputError(
@@ -44,40 +39,10 @@ def refuse_changed(old: SuiteFile, new: SuiteFile, where: str) -> None:
             )
 
 
-def unite(suites: Mapping[str, SuiteFile]) -> dict[str, Any]:
-    """Return a suite with the measurements of all suites; the first sets the rest.
-
-    suites : results of `harness.suite.suite.read_stored` by folder
-
-    Raises
-    ------
-    InputError
-        If suites differ in a limit or in the accuracy.
-
-    """
-    (one, first), *others = suites.items()
-    for other, suite in others:
-        _refuse_unequal(one, first, other, suite, FIXED_KEYS)
-    merged = {
-        key: tuple(e for i, e in enumerate(entries) if e not in entries[:i])
-        for key in ("tolerances", "solvers", "problems")
-        if (entries := [e for suite in suites.values() for e in getattr(suite, key)])
-    }
-    names = [name for suite in suites.values() for name in suite.name.split(_AND)]
-    union: dict[str, Any] = msgspec.to_builtins(
-        msgspec.structs.replace(
-            first,
-            name=_AND.join(dict.fromkeys(names)),
-            repeats=max(suite.repeats for suite in suites.values()),
-            **merged,
-        )
-    )
-    return union
-
-
-def _refuse_unequal(
-    one: str, a: SuiteFile, other: str, b: SuiteFile, keys: Sequence[str]
+def refuse_unequal(
+    one: str, a: SuiteFile, other: str, b: SuiteFile, keys: Sequence[str] = FIXED_KEYS
 ) -> None:
+    """Raise InputError if suites in the files `one` and `other` differ in a key."""
     for key in keys:
         values = getattr(a, key), getattr(b, key)
         if values[0] != values[1]:

@@ -12,7 +12,6 @@ import pytest
 
 import mortarbench as mb
 from mortarbench.cli.main import main
-from mortarbench.harness.files.reading import read_toml
 from mortarbench.harness.files.store import is_stored
 from mortarbench.harness.results.folder import environment_of
 from mortarbench.harness.results.journal import Journal, read_journal
@@ -179,14 +178,8 @@ def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
         "4 of 4 measurements are already present and are counted once"
     ] * 2
     assert all(is_stored(tmp_path / "all", r.vectors) for r in held)
-    assert read_toml(tmp_path / "all/suite.toml") == {
-        "name": "c", "tolerances": [1e-6],
-        "solvers": ["exact", "lax", "liar"], "repeats": 2,
-        "problems": [
-            {"family": "well", "forms": ["dual"], "params": {"depth": [depth]}}
-            for depth in (1, 2)
-        ],
-    }  # fmt: skip
+    texts = {(tmp_path / name / "suite.toml").read_text() for name in ("a", "all")}
+    assert len(texts) == 1
     measure("all", depths="1, 2", solvers='"exact", "lax", "liar"')  # continues the run
     assert len(read_journal(tmp_path / "all")) == 2 * 3 * 2
 
@@ -254,7 +247,7 @@ def renamed(journal, old, new):
         ),
         (
             lambda a, b: (b / "suite.toml").write_text('name = "b"\ntime_limit = 5\n'),
-            r"time_limit is 60 in .*a, 5 in .*b; expected equal settings",
+            r"time_limit is 60 in .*/a/.*, 5 in .*/b/.*; expected equal settings",
         ),
         (
             lambda a, b: renamed(b / "journal", '"solver":"lax"', '"solver":"exact"'),

@@ -289,28 +289,6 @@ def test_a_check_ends_at_its_time_limit_and_the_next_one_is_run():
     assert named == [f"Hangs: check {i} of 2, {checks[i - 1]}" for i in (1, 2)]
 
 
-# Exports.
-
-
-@pytest.mark.parametrize(
-    ("what", "ending"),
-    [
-        *((QP, ending) for ending in ("npz", "mat", "parquet", "qps")),
-        *((SMALL, ending) for ending in ("npz", "mat", "qps")),
-        pytest.param(SMALL, "parquet", marks=pytest.mark.slow),
-    ],
-)
-def test_the_exported_qp_is_the_same_qp(tmp_path, monkeypatch, what, ending):
-    monkeypatch.chdir(tmp_path)
-    path = mb.export(what, f"qp.{ending}")
-    qp = what if isinstance(what, mb.QP) else mb.build(what).qp
-    back = mb.build(f"file:{path}").qp
-    x = np.random.default_rng(0).standard_normal(qp.q.size)
-
-    assert back.objective(x) == pytest.approx(qp.objective(x), rel=1e-12)
-    assert back.sizes == qp.sizes
-
-
 # Suites, figures, replays, conformance.
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.suite.growth import refuse_changed, unite
+from mortarbench.harness.suite.growth import refuse_changed
 from mortarbench.harness.suite.suite import suite_file
 
 SUITE = {
@@ -41,9 +41,3 @@ def test_a_suite_may_be_extended(more):
 def test_settings_of_past_measurements_may_not_change(change, said):
     with pytest.raises(InputError, match=said):
         refuse_changed(suite_file(SUITE), suite_file(SUITE | change), "here")
-
-
-def test_suites_with_other_limits_are_not_united():
-    other = suite_file(SUITE | {"memory_limit": 100})
-    with pytest.raises(InputError, match="memory_limit is 4096 in a, 100 in b;"):
-        unite({"a": suite_file(SUITE), "b": other})
