@@ -1,3 +1,4 @@
+from . import dataset as dataset
 from .answer import Answer as Answer
 from .answer import solve as solve
 from .case import build as build

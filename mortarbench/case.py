@@ -24,7 +24,14 @@ if TYPE_CHECKING:
     from mortarbench.harness import QP, Fields, Mechanics, Solution, Vector
 
 
-EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: suffixes of exported QPs
+EXPORTS = (
+    ".npz",
+    ".mat",
+    ".parquet",
+    ".qps",
+    ".json",
+    ".cbf",
+)  #: suffixes of exported QPs
 
 
 class Case(plugin.Case):
@@ -173,6 +180,13 @@ class Case(plugin.Case):
                 from mortarbench.problems.files.qps import save_qps
 
                 save_qps(path, self.qp, meta)
+            case ".json" | ".cbf":
+                from mortarbench.solvers.common import conic_files
+
+                save = conic_files.save_cbf
+                if path.suffix == ".json":
+                    save = conic_files.save_clarabel
+                save(path, self.qp)
             case _:
                 from mortarbench.harness.files.qpfile import save_qp
 
@@ -252,19 +266,19 @@ def as_case(
 
 def export(
     case: Annotated[object, "CASE"],
-    path: Annotated[str | Path, "FILE.npz|mat|parquet|qps"],
+    path: Annotated[str | Path, "FILE.npz|mat|parquet|qps|json|cbf"],
     *,
     plugins: Plugins = (),
     registries: Registries | None = None,
 ) -> Path:
-    """Write a QP for other programs: .npz, .mat, .parquet or .qps.
+    """Write a QP for other programs: .npz, .mat, .parquet, .qps, .json or .cbf.
 
     Parameters
     ----------
     case : FAMILY/key=value/…/FORM, such as beam-ring/Nr=4/Nh=3/dual; see docs/cases.md.
         In Python also a case of `build`, a QP, or a problem of qpsolvers or cvxpy
     path : file to write; the suffix selects the format: npz (NumPy), mat (MATLAB,
-        Octave), parquet (qpbenchmark), or qps
+        Octave), parquet (qpbenchmark), qps, json (Clarabel), or cbf (CBLIB)
     plugins : Python files with more families
     registries : used for a name instead of built-in registries, installed plug-ins and
         `plugins`

@@ -150,20 +150,20 @@ def _is_feasible(qp: QP, x: Vector, tol: float) -> bool:
 
 def _farkas_candidates(qp: QP, s: Solution) -> Iterator[tuple[Vector, Vector]]:
     yield s.y, np.maximum(s.z, 0)
-    if (least := _least_violation(qp)) is not None:
+    if (least := least_violation(qp)) is not None:
         yield least[1], least[2]
 
 
 def _points(qp: QP, s: Solution) -> Iterator[Vector]:
     yield s.x
-    if (least := _least_violation(qp)) is not None:
+    if (least := least_violation(qp)) is not None:
         x = least[0]
         for one in qp.sets:
             x = one.project(x)
         yield x
 
 
-def _least_violation(qp: QP) -> tuple[Vector, Vector, Vector] | None:
+def least_violation(qp: QP) -> tuple[Vector, Vector, Vector] | None:
     """Return the point in the box that violates scaled rows least, and multipliers.
 
     The linear program minimises t subject to −t ≤ E(Ax − b)/L ≤ t and F(Gx − h)/L ≤ t.
@@ -191,9 +191,14 @@ def _least_violation(qp: QP) -> tuple[Vector, Vector, Vector] | None:
 
 
 def _rays(qp: QP, s: Solution) -> Iterator[Vector]:
-    """Yield x of the solver, then the ray of steepest descent with ‖r̂‖∞ ≤ 1."""
+    """Yield x of the solver, then the ray of steepest descent."""
     if np.isfinite(s.x).all():
         yield s.x
+    yield from steepest_ray(qp)
+
+
+def steepest_ray(qp: QP) -> Iterator[Vector]:
+    """Yield the ray of steepest descent with ‖r̂‖∞ ≤ 1, if it is found."""
     if not qp.is_explicit:
         return
     by, (lower, upper) = scaling_of(qp), hull(qp.sets, qp.q.size)

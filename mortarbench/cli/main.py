@@ -41,8 +41,13 @@ COMMANDS = {
     "paper": ("paper.paper", "reproduce all figures and tables of the paper"),
     "doctor": ("doctor.doctor", "check whether this machine is fit for measurements"),
     "new": ("new.new", "write a template for a solver, a problem or a suite"),
+    "dataset build": ("dataset.build_dataset", "build the public set in a folder"),
+    "dataset check": ("dataset.check_dataset", "check a folder of the public set"),
+    "dataset info": ("dataset.dataset_info", "show what the public set contains"),
     "completion": ("completion.completion", "print a script for bash or zsh"),
 }
+#: help texts of the first words of commands with two words
+GROUPS = {"dataset": "build, check or describe the public set of problems"}
 
 
 def main(registries: Registries, argv: Sequence[str]) -> int:
@@ -184,9 +189,17 @@ def command_parser(argv: Sequence[str]) -> Parser:
     commands = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=Parser
     )
+    groups: dict[str, argparse._SubParsersAction[Parser]] = {}
     for name, (path, what) in COMMANDS.items():
-        command = commands.add_parser(name, help=what, allow_abbrev=False)
-        if [name] == [*argv[:1]]:
+        *group, last = name.split()
+        if group and group[0] not in groups:
+            parent = commands.add_parser(group[0], help=GROUPS[group[0]])
+            groups[group[0]] = parent.add_subparsers(
+                metavar="COMMAND", required=True, parser_class=Parser
+            )
+        under = groups[group[0]] if group else commands
+        command = under.add_parser(last, help=what, allow_abbrev=False)
+        if name.split() == [*argv[: len(group) + 1]]:
             module, _, function_name = path.partition(".")
             run = getattr(import_module(f"mortarbench.cli.{module}"), function_name)
             shared = getattr(mortarbench, function_name, None)

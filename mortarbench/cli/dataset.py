@@ -1,0 +1,56 @@
+"""The commands `dataset build`, `dataset check` and `dataset info`."""
+
+from __future__ import annotations
+
+from json import dumps
+from typing import Annotated
+
+from mortarbench import dataset
+from mortarbench.harness.errors import say
+from mortarbench.registries import Registries
+
+
+def build_dataset(
+    _: Registries,
+    *,
+    out: Annotated[str, "DIR"],
+    everything: Annotated[bool, "--all"] = False,
+) -> int:
+    """Build the public set of problems and sequences with proven optima.
+
+    The core are about 60 problems, and all sequences. The same command continues an
+    interrupted one.
+
+    out : new folder, or one with a part of the set
+    everything : also build the problems behind the core
+    """
+    print(dataset.build(out, everything=everything, progress=say))
+    return 0
+
+
+def check_dataset(_: Registries, folder: Annotated[str, "DIR"]) -> int:
+    """Check the files of a public set, and prove its optima again.
+
+    Exit code 1: a file is missing or was changed, or an optimum is not proven.
+
+    folder : folder of `dataset build`
+    """
+    wrong = dataset.check(folder)
+    print(*wrong or ["every file is unchanged, and every optimum is proven"], sep="\n")
+    return 1 if wrong else 0
+
+
+def dataset_info(_: Registries, *, json: bool = False) -> int:
+    """Show what the public set contains.
+
+    json : print JSON
+    """
+    found = dataset.info()
+    if json:
+        print(dumps(found))
+        return 0
+    for name, value in found.items():
+        items = value.items() if isinstance(value, dict) else ()
+        text = ", ".join(f"{key} {count}" for key, count in items) or value
+        print(f"{name:16} {text}")
+    return 0

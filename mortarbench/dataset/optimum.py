@@ -1,0 +1,222 @@
+"""Bounds of the optimal value, from a feasible point and multipliers.
+
+*Below.* For any x, y and z ≥ 0, let z_box be the part of −(Px + q + Aᵀy + Gᵀz) that is
+normal to the bounds and sets, and r = Px + q + Aᵀy + Gᵀz + z_box. For all feasible w,
+
+    f(w) ≥ −½xᵀPx − bᵀy − hᵀz − σ(z_box) + rᵀw + ½(w − x)ᵀP(w − x).
+
+With P ≥ λD², D = diag(2ᵉ), the last two terms are at least rᵀx − ‖D⁻¹r‖²/2λ. λ > 0 is
+proven by a Cholesky factor L of D⁻¹PD⁻¹ − μI and the norm of its residual. On variables
+with Pᵢᵢ = 0, the term is −|rᵢ|R instead, and the bound holds for |wᵢ − xᵢ| ≤ R = 1e6.
+
+*Above.* x satisfies the equations up to rounding. A point that satisfies them exactly
+is at a distance of at most δ = ‖Ax − b‖/σ, with the least singular value σ of A on the
+variables that are not fixed. All inequalities have slacks of at least δ at x, so that
+this point is feasible. Its objective differs from f(x) by at most δ(‖∇f‖ + δ‖P‖).
+
+Sums are evaluated in extended precision, and bounds of their rounding errors widen the
+interval. Norms and singular values are evaluated in double precision.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import svdvals
+from scipy.sparse import csc_array, csr_array, eye_array, hstack, vstack
+
+from mortarbench.dataset.standard import curvature_exponents
+from mortarbench.harness import QP
+from mortarbench.harness.mechanics import Real
+from mortarbench.harness.qp import Vector
+from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.convex import admissible, hull
+from mortarbench.harness.sets.discs import Discs
+
+RADIUS = 1e6  #: R, distance from x in variables without curvature
+#: Candidates for μ. The last is a quarter of what a shift adds (`standard.SHIFT`)
+CURVATURES = tuple(2.0**-k for k in (4, 10, 16, 22, 28, 32))
+#: Least ratio of singular values of A that counts as full rank.
+MIN_RANK = 1e-8
+_EPS = float(np.finfo(Real).eps)
+#: Factor that moves points into discs by more than the rounding error of a norm.
+_INSIDE = 1 - 2.0**-48
+
+
+class UnprovenError(ArithmeticError):
+    """Error for an optimal value that cannot be bounded; the message is a reason."""
+
+
+class Interval(NamedTuple):
+    """Bounds of an optimal value."""
+
+    low: float
+    high: float
+
+
+def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> Interval:
+    """Return bounds of the optimal value of an explicit QP.
+
+    x, y, z : (n,), (m,), (p,) point and multipliers, of any accuracy
+
+    Raises
+    ------
+    UnprovenError
+        If no bound can be proven, for the reason in the message.
+
+    """
+    if not all(isinstance(one, Box | Discs) for one in qp.sets):
+        raise UnprovenError("cones are not supported")
+    size, z = np.abs(x), np.maximum(z, 0)
+    P, A, G = (M.astype(Real) for M in (qp.P, qp.A, qp.G))
+    Px, roundings = P @ x.astype(Real), _EPS * (x.size + y.size + z.size + 10)
+    objective = 0.5 * (x @ Px) + qp.q.astype(Real) @ x
+    error = roundings * (0.5 * (size @ (abs(P) @ size)) + np.abs(qp.q) @ size)
+    delta = _distance(qp, x)
+    gradient = np.linalg.norm(qp.P @ x + qp.q)
+    high = objective + error + delta * (gradient + delta * _norm(qp.P))
+
+    force = Px + qp.q + A.T @ y.astype(Real) + G.T @ z.astype(Real)
+    sizes = abs(P) @ size + np.abs(qp.q) + abs(A).T @ np.abs(y) + abs(G).T @ z
+    borne = admissible(qp.sets, -force.astype(float))
+    support = sum(one.support(borne) for one in qp.sets)
+    r = force + borne
+    low = r @ x - 0.5 * (x @ Px) - qp.b.astype(Real) @ y - qp.h.astype(Real) @ z
+    error += roundings * (np.abs(qp.b) @ np.abs(y) + np.abs(qp.h) @ z + sizes @ size)
+    error += 4 * np.finfo(float).eps * abs(support)
+    r = np.abs(r) + roundings * sizes
+    curved = np.isfinite(e := curvature_exponents(qp.P))
+    if curved.any():
+        if not (curvature := least_curvature(qp.P)):
+            raise UnprovenError("P is not provably positive semidefinite")
+        error += ((r[curved] / np.exp2(e[curved])) ** 2).sum() / (2 * curvature)
+    low -= support + error + RADIUS * r[~curved].sum()
+    return Interval(float(low), float(high))
+
+
+def least_curvature(P: Any) -> float:
+    """Return λ with P ≥ λD² on the variables with curvature; 0 if none is proven."""
+    e = curvature_exponents(P)
+    used = np.flatnonzero(np.isfinite(e))
+    inner = csc_array(P)[np.ix_(used, used)]
+    if not used.size or abs(inner).sum() < abs(P).sum() * (1 - 1e-12):
+        return 0.0
+    D = np.exp2(-e[used])
+    M = inner.multiply(D).multiply(D[:, None]).tocsc()
+    for mu in CURVATURES:
+        residual = _cholesky_residual(M - mu * eye_array(used.size, format="csc"))
+        if residual <= mu / 2:
+            return mu - residual
+    return 0.0
+
+
+def _cholesky_residual(M: Any) -> float:
+    """Return a bound of ‖M − LLᵀ‖, where L is a Cholesky factor; inf without one.
+
+    The bound contains the rounding errors of LLᵀ, which |L||Lᵀ| bounds by entries.
+    """
+    from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
+
+    try:
+        if M.nnz > M.shape[0] ** 2 / 10:
+            M = M.toarray()
+            L, longest = np.linalg.cholesky(M), M.shape[0]
+        else:
+            factor = cholesky(M)
+            L, order = csc_array(factor.L()), factor.P()
+            M, longest = M[order][:, order], np.diff(csr_array(L).indptr).max()
+    except (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError):
+        return np.inf
+    rounding = (int(longest) + 2) * np.finfo(float).eps * _norm(abs(L) @ abs(L).T)
+    return _norm(M - L @ L.T) + rounding
+
+
+def _distance(qp: QP, x: Vector) -> float:
+    """Return δ, the distance from x to a feasible point.
+
+    Raises
+    ------
+    UnprovenError
+        If there is no feasible point that near, or the equations are dependent.
+
+    """
+    lower, upper = hull(qp.sets, x.size)
+    free, delta, eps = lower < upper, 0.0, x.size * _EPS
+    if qp.b.size:
+        values = svdvals(csc_array(qp.A)[:, np.flatnonzero(free)].toarray())
+        if values.size < qp.b.size or values[-1] <= MIN_RANK * values[0]:
+            raise UnprovenError("the equations are dependent")
+        residual = np.abs(qp.A.astype(Real) @ x.astype(Real) - qp.b)
+        rounding = eps * (abs(qp.A) @ np.abs(x) + np.abs(qp.b))
+        delta = 1.001 * float(np.linalg.norm(residual + rounding)) / values[-1]
+    slack = qp.h - qp.G.astype(Real) @ x.astype(Real)
+    needed = eps * (abs(qp.G) @ np.abs(x) + np.abs(qp.h)) + delta * _lengths(qp)
+    is_near = bool((slack >= needed).all())
+    for one in qp.sets:
+        for limit in one.limits(x):
+            rounding = 1e-15 * limit.size * isinstance(one, Discs)
+            needed = rounding + delta * free[limit.variable]
+            is_near &= bool((limit.slack >= needed).all())
+    if not is_near:
+        raise UnprovenError("its point violates an inequality")
+    return delta
+
+
+def inner_point(qp: QP, x: Vector) -> Vector:
+    """Return a point near x that satisfies inequalities in spite of rounding errors.
+
+    It is between x and s, the point with As = b and |sᵢ − xᵢ| ≤ 1 whose distance τ ≤ 1
+    from the inequalities is the largest. A disc is replaced by a box in it.
+
+    Raises
+    ------
+    UnprovenError
+        If there is no such point.
+
+    """
+    # imported here, since scipy.optimize loads slowly
+    from scipy.optimize import linprog
+
+    for one in qp.sets:
+        x = one.project(x)
+        if isinstance(one, Discs):
+            x[one.index] *= _INSIDE
+    if not qp.b.size + qp.h.size:
+        return x
+    lower, upper = (bound.copy() for bound in hull(qp.sets, x.size))
+    free, n, lengths = lower < upper, x.size, _lengths(qp)
+    for one in qp.sets[1:]:
+        lower[one.block] /= np.sqrt(one.index.shape[1])  # type: ignore[attr-defined]
+        upper[one.block] = -lower[one.block]
+    eye = eye_array(n, format="csr")
+    rows, sides = [hstack([csr_array(qp.G), lengths[:, None]])], [qp.h]
+    zeros = np.zeros((qp.b.size, 1))
+    for sign, bound in ((1.0, upper), (-1.0, lower)):
+        k = np.flatnonzero(np.isfinite(bound) & free)
+        rows.append(hstack([sign * eye[k], np.ones((k.size, 1))]))
+        sides.append(sign * bound[k])
+    s = linprog(
+        np.append(np.zeros(n), -1.0),
+        A_ub=csr_array(vstack(rows)),
+        b_ub=np.concatenate(sides),
+        A_eq=csr_array(hstack([csr_array(qp.A), zeros])) if qp.b.size else None,
+        b_eq=qp.b if qp.b.size else None,
+        bounds=[*np.where(free, x + np.array([[-1.0], [1.0]]), x).T, (None, 1.0)],
+    ).x
+    if s is None or s[n] <= 0:
+        raise UnprovenError("the inequalities have no common interior point")
+    over = float(((qp.G @ x - qp.h) / lengths).max(initial=0.0))
+    omega = max(over, 0.0) + 1e-14 * max(1.0, np.abs(x).max())
+    return np.asarray(x + min(4 * omega / (omega + s[n]), 1.0) * (s[:n] - x))
+
+
+def _lengths(qp: QP) -> Vector:
+    """Return the lengths (p,) of the rows of G; 1 for rows of zeros."""
+    lengths = np.sqrt(csr_array(qp.G).power(2).sum(axis=1))
+    return np.where(lengths > 0, lengths, 1.0)
+
+
+def _norm(M: Any) -> float:
+    """Return the Frobenius norm of a dense or sparse matrix."""
+    return float(np.linalg.norm(M if isinstance(M, np.ndarray) else M.data))

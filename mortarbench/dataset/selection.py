@@ -1,0 +1,339 @@
+"""Selection of the public set: ``python -m mortarbench.dataset.selection``.
+
+Every candidate is built, scaled and rounded; candidates whose optimum is not proven to
+1e-8 are left out, as are those with the same numbers as an earlier one. The core are at
+most four problems of each family. They are chosen by farthest points (Gonzalez 1985) in
+standardised features, most of them logarithms: the next problem is the one whose
+nearest chosen problem is the farthest away.
+
+The command writes the catalogue and, in ``bits.npz``, the last bits of all arrays that
+differ between two kernels of OpenBLAS. Packages that are rebuilt then agree.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import count
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import eigsh
+
+from mortarbench.case import as_case
+from mortarbench.dataset.folder import store_problem
+from mortarbench.dataset.items import (
+    HERE,
+    INFEASIBLE,
+    ITERATION,
+    MAX_BOUND,
+    OPTIMAL,
+    REVERSED,
+    UNBOUNDED,
+    Certificate,
+    Row,
+    certificate,
+    iterations,
+    objections,
+    original,
+    standard_qp,
+    write_catalogue,
+)
+from mortarbench.dataset.optimum import (
+    UnprovenError,
+    least_curvature,
+    optimum_interval,
+)
+from mortarbench.dataset.standard import (
+    Scales,
+    curvature_exponents,
+    last_bits,
+    numbers,
+    scaled,
+    scales_of,
+)
+from mortarbench.harness import QP, InputError
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.errors import say
+from mortarbench.harness.files.npz import write_mappable
+from mortarbench.harness.suite.suite import load_suite
+from mortarbench.registries import Registries, one_thread
+
+CANDIDATES = "candidates.toml"  #: suite of the single problems and most sequences
+#: Bodies that only contact holds. Reversed loads pull them away.
+REVERSED_CASES = (
+    "membranes/n=4/primal",
+    "membranes/n=8/primal",
+    "membranes/n=4/dual",
+    "membranes/n=8/dual",
+    "contact-patch/dual",
+    "hertz-plane/n=8/dual",
+    "half-plane/n=40/dual",
+)
+#: Cases whose fixed-point iterations for Coulomb's law are sequences.
+COULOMB_CASES = (
+    "beam-ring/Nr=8/Nh=5/steps=1/friction=coulomb/mu=0.3/dual-bounds",
+    "greco/n=16/mu=1/dual-bounds",
+    "greco/n=16/mu=0.4/dual",
+    "hertz-cylinder/n=10/m=8/friction=coulomb/mu=0.3/Q=0.5/dual",
+)
+CAP = 4  #: largest number of problems of a family in the core
+KERNELS = ("Haswell", "Prescott")  #: two kernels of OpenBLAS, for any x86-64 processor
+#: Eigenvalues of the scaled P below this fraction of the largest count as zero.
+ZERO = 1e-8
+#: Largest n for which all eigenvalues are computed, and their number for larger n.
+MAX_DENSE, LEAST = 1500, 20
+#: Constraints are active if their slack is below this fraction of the largest size;
+#: active constraints are weakly active if their multiplier is, of the largest.
+ACTIVE = 1e-7
+
+
+def main() -> None:
+    """Select the set, and write its catalogue and stored bits."""
+    if sys.argv[1:]:  # print the digests of all numbers, in another process
+        return print(json.dumps(_digests(json.load(sys.stdin))))
+    rows = sorted(described(), key=lambda row: row["path"])
+    choose_core(rows)
+    bits, digests = (
+        dict[str, Any](),
+        [_digests_under(kernel, rows) for kernel in KERNELS],
+    )
+    for row, *both in zip(rows, *digests, strict=True):
+        differing = [name for name in both[0] if both[0][name] != both[1][name]]
+        qp = _scaled(row)
+        bits |= {f"{row['name']}/{name}": last_bits(qp, name) for name in differing}
+        row["stored"] = " ".join(differing)
+    write_mappable(HERE / "bits.npz", bits)
+    for row in rows:
+        row["digest"] = store_problem(row)
+    write_catalogue(HERE, rows)
+
+
+def described() -> Iterator[Row]:
+    """Yield the lines of all items whose optimum is proven, without their digests."""
+    names = Counter[str]()
+    for row in _items():
+        try:
+            with one_thread():
+                complete = _described(row)
+        except (UnprovenError, InputError, ArithmeticError) as e:
+            say(f"{row['name']} is left out: {e}")
+            continue
+        names[row["name"]] += 1
+        if names[row["name"]] == 1:
+            say(row["name"])
+            yield complete
+
+
+def _items() -> Iterator[Row]:
+    """Yield lines with names, cases and changes of all candidates.
+
+    The last step of a sequence, which determines its scales, precedes the others.
+    """
+    registries = Registries()
+    suite = load_suite(HERE / CANDIDATES, registries.families, registries.solvers)
+    for case in suite.cases:
+        yield _row(case.name, "", OPTIMAL)
+    for name in REVERSED_CASES:
+        kind = UNBOUNDED if name.endswith("primal") else INFEASIBLE
+        yield _row(name, REVERSED, kind)
+    for steps in suite.sequences:
+        first, last = (case.name.split("/") for case in (steps[0], steps[-1]))
+        sequence = _slug(p if p in last else p.partition("=")[0] for p in first)
+        for step, case in reversed([*enumerate(steps, 1)]):
+            yield _row(case.name, "", OPTIMAL, sequence, step)
+    for name in COULOMB_CASES:
+        sequence = _slug([*name.split("/"), "iterations"])
+        for step in reversed(range(1, 1 + len(iterations(name)))):
+            yield _row(name, f"{ITERATION}{step}", OPTIMAL, sequence, step)
+
+
+def _row(case: str, change: str, kind: str, sequence: str = "", step: int = 0) -> Row:
+    case = as_case(case).name
+    name = _slug(case.split("/")) + "-reversed" * (change == REVERSED)
+    name = f"{sequence}/{step:03}" if sequence else name
+    return {
+        "name": name,
+        "path": f"{'sequences' if sequence else 'problems'}/{name}.npz",
+        "core": "no",
+        "family": case.partition("/")[0],
+        "sequence": sequence,
+        "step": str(step or ""),
+        "kind": kind,
+        "case": case,
+        "change": change,
+        "licence": "BSD-3-Clause",
+        "units": "none; energy in SI = energy_scale * f + energy_constant",
+        "provenance": f"mortarbench export {case} FILE.npz"
+        + f", {change}" * bool(change),
+    }
+
+
+def _slug(parts: Iterable[str]) -> str:
+    return re.sub(r"\.0\b|=", "", "-".join(parts))
+
+
+_SCALES: dict[str, Scales] = {}  #: scales of a sequence: those of its last step
+
+
+def _described(row: Row) -> Row:
+    case = as_case(row["case"]).family_case
+    qp, value = original(row["case"], row["change"]), 0.0
+    if row["kind"] == OPTIMAL:
+        value = qp.objective(Registries().reference(qp).x)
+    scales = scales_of(qp, value)
+    if row["sequence"]:
+        scales = _SCALES.setdefault(row["sequence"], scales)
+    row |= {"scales": " ".join(map(str, scales)), "shifted": "no"}
+    if row["kind"] != UNBOUNDED and not least_curvature(standard_qp(row, {}).P):
+        row["shifted"] = "yes"
+    final = standard_qp(row, {})
+    proof = certificate(row["kind"], final)
+    row |= {"optimum": "", "bound": ""}
+    if row["kind"] == OPTIMAL:
+        row |= _optimum(final, proof)
+    for objection in objections(row, final, proof):
+        raise UnprovenError(objection)
+    factor = 2.0**-scales.objective * case.scale
+    constant = "" if row["change"] else repr(case.constant)
+    row |= {"energy_scale": repr(factor), "energy_constant": constant}
+    return row | _structure(final) | _activity(final, proof)
+
+
+def _optimum(qp: QP, proof: Certificate) -> Row:
+    """Return the optimum and a bound of its error, 1e-10, 1e-9 or 1e-8 max(1, |f*|)."""
+    low, high = optimum_interval(qp, proof["x"], proof["y"], proof["z"])
+    optimum = float(f"{(low + high) / 2:.12g}")
+    size = max(1.0, abs(optimum))
+    error = 2 * max(high - optimum, optimum - low) + 1e-12 * size
+    for bound in (1e-10, 1e-9, MAX_BOUND):
+        if error <= bound * size:
+            return {"optimum": repr(optimum), "bound": repr(bound * size)}
+    raise UnprovenError(f"the optimum is proven only to {error:.1e}")
+
+
+def _structure(qp: QP) -> Row:
+    """Return sizes, and estimates of condition and rank of the scaled P."""
+    P, n = csc_array(qp.P), qp.q.size
+    e = curvature_exponents(P)
+    D = diags_array(np.where(np.isfinite(e), np.exp2(-e), 0.0))
+    M = csc_array(D @ P @ D)
+    if n <= MAX_DENSE:
+        values = np.linalg.eigvalsh(M.toarray())
+    else:
+        least = eigsh(M, LEAST, sigma=-1e-6, return_eigenvectors=False)
+        values = np.append(least, eigsh(M, 1, return_eigenvectors=False))
+    positive = values[values > ZERO * values.max()]
+    rank = n - (values.size - positive.size)
+    sizes = qp.sizes
+    return {
+        "dense": _yes(isinstance(qp.P, np.ndarray)),
+        "strictly_convex": _yes(rank == n),
+        "discs": str(sizes.get("discs", 0)),
+        "n": str(n),
+        "equalities": str(sizes["equalities"]),
+        "inequalities": str(sizes["inequalities"]),
+        "bounds": str(sizes["bounds"]),
+        "nnz": str(P.nnz + csc_array(qp.A).nnz + csc_array(qp.G).nnz),
+        "condition": f"{positive.max() / positive.min():.1e}",
+        "rank": str(rank),
+    }
+
+
+def _activity(qp: QP, proof: Certificate) -> Row:
+    """Return the share of active inequalities, and of weakly active ones among them."""
+    if not {"x", "y", "z"} <= proof.keys():
+        return {"active_share": "", "degeneracy": ""}
+    x, z = proof["x"], proof["z"]
+    force = np.abs(qp.P @ x + qp.q + qp.A.T @ proof["y"] + qp.G.T @ z)
+    slacks, multipliers = [qp.h - qp.G @ x], [z]
+    for one in qp.sets:
+        for limits in one.limits(x):
+            slacks.append(limits.slack)
+            multipliers.append(force[limits.variable])
+    slack, multiplier = np.concatenate(slacks), np.concatenate(multipliers)
+    active = slack <= ACTIVE * max(np.abs(x).max(), 1e-300)
+    weak = active & (multiplier <= ACTIVE * max(multiplier.max(initial=0.0), 1e-300))
+    return {
+        "active_share": f"{active.mean() if active.size else 0:.3f}",
+        "degeneracy": f"{weak.sum() / max(active.sum(), 1):.3f}",
+    }
+
+
+def features(row: Row) -> list[float]:
+    """Return the features by which problems are compared."""
+    number = {k: float(row[k] or 0) for k in ("n", "nnz", "rank", "active_share")}
+    n, m = number["n"], float(row["equalities"]) + float(row["inequalities"])
+    return [
+        np.log10(n),
+        np.log10(1 + m),
+        np.log10(number["nnz"] / n),
+        np.log10(float(row["condition"])),
+        number["active_share"],
+        float(row["degeneracy"] or 0),
+        1 - number["rank"] / n,
+        float(row["discs"] != "0"),
+        float(row["dense"] == "yes"),
+        float(row["kind"] != OPTIMAL),
+    ]
+
+
+def choose_core(rows: Sequence[Row]) -> None:
+    """Set ``core`` of at most `CAP` single problems per family to ``yes``.
+
+    The first is the one nearest to the mean. Ties go to the earlier line.
+    """
+    single = [row for row in rows if not row["sequence"]]
+    points = np.array([features(row) for row in single])
+    points = (points - points.mean(axis=0)) / np.maximum(points.std(axis=0), 1e-12)
+    far = 1 / (1 + np.linalg.norm(points, axis=1))
+    open_, taken = np.ones(len(single), dtype=bool), Counter[str]()
+    for chosen in count():
+        if not open_.any():
+            return
+        i = int(np.argmax(np.where(open_, far, -1.0)))
+        family = single[i]["family"]
+        single[i]["core"], taken[family] = "yes", taken[family] + 1
+        distance = np.linalg.norm(points - points[i], axis=1)
+        far = distance if not chosen else np.minimum(far, distance)
+        open_ &= [r["core"] == "no" and taken[r["family"]] < CAP for r in single]
+
+
+def _digests(rows: Sequence[Row]) -> list[dict[str, str]]:
+    """Return digests of the unrounded numbers of all items, by the names of arrays."""
+    with one_thread():
+        return [
+            {k: hex_digest([v.tobytes()]) for k, (v, _) in n.items()}
+            for n in map(numbers, map(_scaled, rows))
+        ]
+
+
+def _scaled(row: Row) -> QP:
+    scales = Scales(*map(int, row["scales"].split()))
+    return scaled(original(row["case"], row["change"]), scales)
+
+
+def _digests_under(kernel: str, rows: Sequence[Row]) -> Any:
+    done = subprocess.run(
+        [sys.executable, "-m", "mortarbench.dataset.selection", "digests"],
+        input=json.dumps(rows),
+        env=os.environ | {"OPENBLAS_CORETYPE": kernel},
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    return json.loads(done.stdout)
+
+
+def _yes(flag: bool) -> str:
+    return "yes" if flag else "no"
+
+
+if __name__ == "__main__":
+    main()
