@@ -22,9 +22,8 @@ from mortarbench.dataset.items import (
 from mortarbench.harness import InputError, checked
 from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.files.durable import report_full_disk
-from mortarbench.harness.files.npz import write_mappable
 from mortarbench.harness.files.qpfile import load_qp, save_qp
-from mortarbench.harness.files.store import mapped_arrays
+from mortarbench.harness.files.store import read_arrays, write_arrays
 from mortarbench.registries import one_thread
 
 CHECKSUMS = "CHECKSUMS"
@@ -85,7 +84,7 @@ def build(
                         differing.append(row["path"])
                     proof.parent.mkdir(parents=True, exist_ok=True)
                     qp, _ = load_qp(path)
-                    write_mappable(proof, dict(certificate(row["kind"], qp)))
+                    write_arrays(proof, dict(certificate(row["kind"], qp)))
         for name in COPIED:
             shutil.copyfile(HERE / name, folder / name)
         for name, kind in TEST_SETS.items():
@@ -157,7 +156,7 @@ def store_problem(row: Row) -> str:
 
 def _stored(row: Row, path: Path) -> str:
     """Build the problem of an item, write it to `path`, and return its digest."""
-    bits = mapped_arrays(HERE / "bits.npz")
+    bits = read_arrays(HERE / "bits.npz", ())
     own = {k: bits[f"{row['name']}/{k}"] for k in row["stored"].split()}
     qp = standard_qp(row, own)
     meta = {k: row[k] for k in ("name", "case", "change", "kind", "optimum", "bound")}
@@ -182,7 +181,7 @@ def _wrong(folder: Path, row: Row) -> Iterator[str]:
         return
     try:
         qp, _ = load_qp(path)
-        yield from objections(row, qp, mapped_arrays(proof))
+        yield from objections(row, qp, read_arrays(proof, ()))
     except (InputError, ValueError) as e:
         yield f"cannot be checked: {e}"
 

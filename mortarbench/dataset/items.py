@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 
-from mortarbench.case import as_case
+from mortarbench.case import Case, as_case
 from mortarbench.dataset.optimum import (
     UnprovenError,
     inner_point,
@@ -86,11 +86,17 @@ def write_catalogue(folder: Path, rows: list[Row]) -> None:
         writer.writerows(rows)
 
 
+@lru_cache(maxsize=2)
+def cached_case(name: str) -> Case:
+    """Return a case, which builds its QP once."""
+    return as_case(name)
+
+
 def original(case: str, change: str) -> QP:
     """Return the QP of a case with a change, before scaling and rounding."""
     if change.startswith(ITERATION):
         return iterations(case)[int(change.removeprefix(ITERATION)) - 1]
-    qp = as_case(case).family_case.qp
+    qp = cached_case(case).family_case.qp
     P = qp.P if qp.is_explicit else assembled(qp.P)
     sign = -1 if change == REVERSED else 1
     return QP(P=P, q=sign * qp.q, A=qp.A, b=sign * qp.b, G=qp.G, h=qp.h, sets=qp.sets)
@@ -103,8 +109,7 @@ def iterations(name: str) -> tuple[QP, ...]:
     The first bound is twice the largest, everywhere. The tangential forces, which have
     two bounds, follow the normal forces, in the same order.
     """
-    case = as_case(name)
-    qp, mu = original(name, ""), float(case.params["mu"])
+    qp, mu = original(name, ""), float(cached_case(name).params["mu"])
     tangents = np.flatnonzero(np.isfinite(qp.lb) & np.isfinite(qp.ub))
     normals, found = tangents - tangents.size, [qp]
     bound = np.full(tangents.size, 2 * qp.ub[tangents].max())

@@ -20,6 +20,8 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -38,6 +40,7 @@ from mortarbench.dataset.items import (
     UNBOUNDED,
     Certificate,
     Row,
+    cached_case,
     certificate,
     iterations,
     objections,
@@ -59,9 +62,8 @@ from mortarbench.dataset.standard import (
     scales_of,
 )
 from mortarbench.harness import QP, InputError
-from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.errors import say
-from mortarbench.harness.files.npz import write_mappable
+from mortarbench.harness.files.store import Arrays, write_arrays
 from mortarbench.harness.suite.suite import load_suite
 from mortarbench.registries import Registries, one_thread
 
@@ -85,6 +87,8 @@ COULOMB_CASES = (
 )
 CAP = 4  #: largest number of problems of a family in the core
 KERNELS = ("Haswell", "Prescott")  #: two kernels of OpenBLAS, for any x86-64 processor
+MAX_ERROR = 100  #: largest difference, in units, that the stored bits correct
+UNIT = ":unit"  #: end of the names of units
 #: Eigenvalues of the scaled P below this fraction of the largest count as zero.
 ZERO = 1e-8
 #: Largest n for which all eigenvalues are computed, and their number for larger n.
@@ -96,23 +100,43 @@ ACTIVE = 1e-7
 
 def main() -> None:
     """Select the set, and write its catalogue and stored bits."""
-    if sys.argv[1:]:  # print the digests of all numbers, in another process
-        return print(json.dumps(_digests(json.load(sys.stdin))))
+    if sys.argv[1:]:  # in another process
+        return _write_numbers(Path(sys.argv[1]), json.load(sys.stdin))
     rows = sorted(described(), key=lambda row: row["path"])
+    one, other = (numbers_under(kernel, rows) for kernel in KERNELS)
+    rows = [row for row in rows if differing(row, one, other) is not None]
     choose_core(rows)
-    bits, digests = (
-        dict[str, Any](),
-        [_digests_under(kernel, rows) for kernel in KERNELS],
-    )
-    for row, *both in zip(rows, *digests, strict=True):
-        differing = [name for name in both[0] if both[0][name] != both[1][name]]
-        qp = _scaled(row)
-        bits |= {f"{row['name']}/{name}": last_bits(qp, name) for name in differing}
-        row["stored"] = " ".join(differing)
-    write_mappable(HERE / "bits.npz", bits)
+    bits = dict[str, Any]()
+    for row in rows:
+        names = differing(row, one, other) or []
+        row["stored"] = " ".join(names)
+        for name in (f"{row['name']}/{name}" for name in names):
+            bits[name] = last_bits(one[name], one[f"{name}{UNIT}"])
+    write_arrays(HERE / "bits.npz", bits)
     for row in rows:
         row["digest"] = store_problem(row)
     write_catalogue(HERE, rows)
+    return None
+
+
+def differing(row: Row, one: Arrays, other: Arrays) -> list[str] | None:
+    """Return the arrays of an item that differ between two kernels.
+
+    The result is None if they differ by more than the stored bits correct, for
+    instance because a kernel of a matrix has another basis.
+
+    one, other : results of `numbers_under`
+    """
+    start, found = f"{row['name']}/", list[str]()
+    for name in (k for k in one if k.startswith(start) and not k.endswith(UNIT)):
+        finite, unit = np.isfinite(one[name]), one[f"{name}{UNIT}"]
+        a, b = (np.where(finite, each[name], 0) for each in (one, other))
+        error = float((np.abs(a - b) / unit).max(initial=0.0))
+        if error > MAX_ERROR:
+            say(f"{row['name']} is left out: {name} differs by {error:.0f} units")
+            return None
+        found += [name.removeprefix(start)] * (error > 0)
+    return found
 
 
 def described() -> Iterator[Row]:
@@ -183,7 +207,7 @@ _SCALES: dict[str, Scales] = {}  #: scales of a sequence: those of its last step
 
 
 def _described(row: Row) -> Row:
-    case = as_case(row["case"]).family_case
+    case = cached_case(row["case"]).family_case
     qp, value = original(row["case"], row["change"]), 0.0
     if row["kind"] == OPTIMAL:
         value = qp.objective(Registries().reference(qp).x)
@@ -305,13 +329,15 @@ def choose_core(rows: Sequence[Row]) -> None:
         open_ &= [r["core"] == "no" and taken[r["family"]] < CAP for r in single]
 
 
-def _digests(rows: Sequence[Row]) -> list[dict[str, str]]:
-    """Return digests of the unrounded numbers of all items, by the names of arrays."""
+def _write_numbers(path: Path, rows: Sequence[Row]) -> None:
+    """Write the unrounded numbers of all items to an npz file."""
     with one_thread():
-        return [
-            {k: hex_digest([v.tobytes()]) for k, (v, _) in n.items()}
-            for n in map(numbers, map(_scaled, rows))
-        ]
+        every = {row["name"]: numbers(_scaled(row)) for row in rows}
+    arrays = dict[str, Any]()
+    for name, found in every.items():
+        for k, (vector, unit) in found.items():
+            arrays |= {f"{name}/{k}": vector, f"{name}/{k}{UNIT}": np.asarray(unit)}
+    write_arrays(path, arrays)
 
 
 def _scaled(row: Row) -> QP:
@@ -319,16 +345,19 @@ def _scaled(row: Row) -> QP:
     return scaled(original(row["case"], row["change"]), scales)
 
 
-def _digests_under(kernel: str, rows: Sequence[Row]) -> Any:
-    done = subprocess.run(
-        [sys.executable, "-m", "mortarbench.dataset.selection", "digests"],
-        input=json.dumps(rows),
-        env=os.environ | {"OPENBLAS_CORETYPE": kernel},
-        capture_output=True,
-        check=True,
-        text=True,
-    )
-    return json.loads(done.stdout)
+def numbers_under(kernel: str, rows: Sequence[Row]) -> Arrays:
+    """Return the unrounded numbers of all items, and units, with a BLAS kernel."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "numbers.npz")
+        subprocess.run(
+            [sys.executable, "-m", "mortarbench.dataset.selection", path],
+            input=json.dumps(rows),
+            env=os.environ | {"OPENBLAS_CORETYPE": kernel},
+            check=True,
+            text=True,
+        )
+        with np.load(path) as data:
+            return dict(data)
 
 
 def _yes(flag: bool) -> str:

@@ -131,9 +131,8 @@ def rounded(qp: QP, bits: Mapping[str, Integers], *, is_shifted: bool) -> QP:
     )
 
 
-def last_bits(qp: QP, name: str) -> NDArray[np.uint8]:
-    """Return the last eight bits of the integers of an array of a scaled QP."""
-    vector, unit = numbers(qp)[name]
+def last_bits(vector: Vector, unit: Any) -> NDArray[np.uint8]:
+    """Return the last eight bits of the integers of numbers with a unit."""
     return np.asarray(_integers(vector, unit) % _KEPT, dtype=np.uint8)
 
 

@@ -267,6 +267,7 @@ def test_every_command_prints_only_json_even_if_a_library_in_c_prints(pit, tmp_p
         "report": ("report", "out/pit", "--format", "csv"),
         "replay": ("replay", "out/pit", "RUN_ID", *plugin),
         "doctor": ("doctor",),
+        "dataset info": ("dataset", "info"),
     }
     for arguments in commands.values():
         if "RUN_ID" in arguments:
@@ -283,7 +284,7 @@ def test_every_command_prints_only_json_even_if_a_library_in_c_prints(pit, tmp_p
     assert set(commands) == {
         name
         for name in COMMANDS
-        if any(a.dest == "json" for a in command_parser([name]).arguments())
+        if any(a.dest == "json" for a in command_parser(name.split()).arguments())
     }
 
 
@@ -469,9 +470,11 @@ def test_the_version_is_that_of_the_package(cli, capsys):
 
 def test_every_command_and_option_has_a_help_text():
     for name in COMMANDS:
-        parser = command_parser([name])
-        (commands,) = parser._subparsers._group_actions
-        assert commands.choices[name].description
+        parser = command = command_parser(name.split())
+        for word in name.split():
+            (commands,) = command._subparsers._group_actions
+            command = commands.choices[word]
+        assert command.description
         assert all(action.help for action in parser.arguments()), name
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from math_core import LatexError, LatexToMathML
 
+from mortarbench.cli.main import COMMANDS
 from mortarbench.solvers import SOLVERS
 
 sys.path.append(str(Path(__file__).parent))
@@ -215,8 +216,7 @@ def command_page() -> str:
             command, check=True, capture_output=True, text=True, env=environment
         ).stdout
 
-    commands = re.findall(r"^    ([a-z-]+)(?: |$)", printed(), re.M)
-    sections = (f"## {c}\n\n```text\n{printed(c)}```" for c in commands)
+    sections = (f"## {c}\n\n```text\n{printed(*c.split())}```" for c in COMMANDS)
     return "\n\n".join(
         [
             "# Commands",

@@ -14,7 +14,7 @@ import mortarbench as mb
 from mortarbench.cli.main import main as command_line
 from mortarbench.dataset import folder as folders
 from mortarbench.dataset.items import catalogue, objections
-from mortarbench.harness.files.npz import write_mappable
+from mortarbench.harness.files.store import write_arrays
 from mortarbench.registries import Registries
 
 pytestmark = pytest.mark.together
@@ -135,7 +135,7 @@ def test_a_wrong_certificate_proves_nothing(copy, capsys, name):
         np.full_like(proof[key], np.nan),
         proof["x"][:3] if "x" in proof else proof["y"][:1],
     ):
-        write_mappable(path, proof | {key: wrong})
+        write_arrays(path, proof | {key: wrong})
         assert row["path"] in refuted(copy, capsys)
 
 
@@ -196,13 +196,12 @@ def test_the_whole_core_has_the_same_bytes_under_another_kernel(kernel):
 
 
 def test_arrays_without_stored_bits_are_those_that_do_not_depend_on_blas():
-    from mortarbench.dataset.selection import KERNELS, _digests_under
+    from mortarbench.dataset.selection import KERNELS, differing, numbers_under
 
     rows = few()
-    for row, one, other in zip(
-        rows, *(_digests_under(k, rows) for k in KERNELS), strict=True
-    ):
-        assert row["stored"].split() == [k for k in one if one[k] != other[k]]
+    one, other = (numbers_under(kernel, rows) for kernel in KERNELS)
+    for row in rows:
+        assert row["stored"].split() == differing(row, one, other)
 
 
 def test_bad_folders_are_refused_in_one_line(tmp_path, capsys):

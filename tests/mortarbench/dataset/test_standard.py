@@ -69,7 +69,8 @@ def test_rounding_is_small_idempotent_and_symmetric(dense):
 def test_the_stored_bits_undo_errors_of_a_hundred_units():
     rng = np.random.default_rng(4)
     qp = random_qp(4, dense=True)
-    bits = {name: last_bits(qp, name) for name in ("P", "q", "ub", "disc_radius")}
+    names = ("P", "q", "ub", "disc_radius")
+    bits = {name: last_bits(*numbers(qp)[name]) for name in names}
     noise = 1 + 5e-11 * rng.uniform(-1, 1, (9, 9))
     noisy = QP(
         P=qp.P * (noise + noise.T) / 2,
