@@ -112,7 +112,6 @@ cdef extern from "incomplete.h" nogil:
         const int *target
         const double *below
         const double *diagonal
-        const double *scale
         Py_ssize_t width
         const Py_ssize_t *offset
         const int *between
@@ -126,9 +125,7 @@ cdef extern from "incomplete.h" nogil:
     void find_runs(incomplete *F, const double *free, Py_ssize_t most)
     bint factorise_incompletely(incomplete *F, const double *free, double keep,
                                 double shift, double least)
-    void solve_incompletely(const incomplete *F, const double *v, double *z)
-    void scaled_matrix(const int *indptr, const int *indices, const double *data,
-                       const double *s, double *scaled, Py_ssize_t n, double *row_sums)
+    void solve_incompletely(const incomplete *F, double s, const double *v, double *z)
 
 include "operations.pxi"
 include "coarse.pxi"

@@ -16,8 +16,7 @@ involve E, and the Schur complement
 
 For k variables in E and b other variables, the factorisation of P_EE costs O(k³)
 operations, and the assembly of the Schur complement O(k²b + kb²). In duals of contact
-problems, E contains the support forces, and P_EE = F_EE is the same in every load step
-if the bodies are linearly elastic.
+problems, E contains the support forces.
 """
 
 from __future__ import annotations
@@ -30,9 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
-from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Box, Discs, Matrix, Solution, Vector, no_rows
+from mortarbench.harness import QP, Box, Discs, Solution, Vector, no_rows
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
 #: Thresholds for the singular values of the orthonormal rows restricted to E. Values of
@@ -40,16 +38,10 @@ from mortarbench.solvers.smalbe.rows import orthonormal_rows
 #: value is between these thresholds, nothing is eliminated, because the reciprocal of
 #: this value would cause rounding errors above the tolerance in the reduced matrix.
 RANK_ZERO, RANK_GOOD = 1e-12, 1e-2
+#: smaller entries of D are replaced by this factor times the largest one
+SMALLEST_DIAGONAL = 1e-10
 
 Array = NDArray[np.float64]
-
-
-class FreeBlock(NamedTuple):
-    """The block P_EE with its Cholesky factor."""
-
-    matrix: Array  #: (k, k)
-    #: upper triangular R (k, k) with P_EE = RᵀR; the lower triangle is arbitrary
-    factor: Array
 
 
 class Eliminated(NamedTuple):
@@ -57,9 +49,7 @@ class Eliminated(NamedTuple):
 
     qp: QP  #: reduced QP, with a dense P
     recover: Callable[[Solution], Solution]
-    G: Array  #: (m, n) equality rows of the original QP
-    block: FreeBlock  #: block with the factor, for later QPs with the same P_EE
-    columns: int  #: number of factorised columns of P_EE; 0 if a stored factor was used
+    columns: int  #: number of factorised columns of P_EE
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,24 +78,21 @@ class _Saddle:
         return S
 
 
-def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | None:
+def eliminate_free(qp: QP) -> Eliminated | None:
     """Eliminate the free variables; return None if this is not possible.
 
-    Elimination requires an explicit P with positive definite P_EE, both free and other
+    Elimination requires a dense P with positive definite P_EE, both free and other
     variables, and consistent equality rows. After orthonormalisation, each
     singular value of these rows restricted to E must be either zero up to rounding or
-    far above rounding. A QP with inequality rows is not reduced.
-
-    previous : block of an earlier problem, used if P_EE has not changed
+    far above rounding.
     """
     free = np.ones(qp.q.size, dtype=bool)
     for one in qp.sets:
         free[one.block] = False
-    if free.all() or not free.any() or not qp.is_explicit or qp.h.size:
+    if free.all() or not free.any() or not isinstance(qp.P, np.ndarray):
         return None
     rows = orthonormal_rows(qp.A, qp.b)
-    block = _factorised(_block(qp.P, free, free), previous)
-    if block is None or not rows.consistent:
+    if not rows.consistent:
         return None
     C_E = rows.C[:, free]
     left, size, _ = np.linalg.svd(C_E, full_matrices=C_E.shape[0] > C_E.shape[1])
@@ -115,48 +102,69 @@ def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | No
     meets, others = left[:, :rank], left[:, rank:]
     G, N, Cx = meets.T @ rows.C, others.T @ rows.C, rows.C @ rows.x_tilde
     try:
-        solve = _saddle(block, G[:, free])
-    except LinAlgError:  # G_E P_EE⁻¹ G_Eᵀ is singular to rounding
+        solve = _saddle(_cholesky(_block(qp.P, free, free)), G[:, free])
+    except LinAlgError:  # P_EE or G_E P_EE⁻¹ G_Eᵀ is singular to rounding
         return None
     G_I, P_EI = G[:, ~free], _block(qp.P, free, ~free)
     number = np.cumsum(~free) - 1  # indices in x_I
     x_0, y_0 = solve(-qp.q[free], meets.T @ Cx)
-    reduced = QP(
-        P=solve.complement(P_EI, _block(qp.P, ~free, ~free), G_I),
-        q=qp.q[~free] + P_EI.T @ x_0 + G_I.T @ y_0,
-        A=N[:, ~free],
-        b=others.T @ Cx,
-        G=no_rows(int((~free).sum())),
-        h=np.zeros(0),
-        sets=(
-            Box(qp.lb[~free], qp.ub[~free]),
-            *(
-                replace(one, index=number[one.index])
-                for one in qp.sets
-                if isinstance(one, Discs)
+    reduced, root = _scaled(
+        QP(
+            P=solve.complement(P_EI, _block(qp.P, ~free, ~free), G_I),
+            q=qp.q[~free] + P_EI.T @ x_0 + G_I.T @ y_0,
+            A=N[:, ~free],
+            b=others.T @ Cx,
+            G=no_rows(int((~free).sum())),
+            h=np.zeros(0),
+            sets=(
+                Box(qp.lb[~free], qp.ub[~free]),
+                *(
+                    replace(one, index=number[one.index])
+                    for one in qp.sets
+                    if isinstance(one, Discs)
+                ),
             ),
-        ),
+        )
     )
 
     def recover(s: Solution) -> Solution:
-        top = -qp.q[free] - P_EI @ s.x
-        x_E, y_R = solve(top, meets.T @ Cx - G_I @ s.x)
+        x_I = s.x / root
+        x_E, y_R = solve(-qp.q[free] - P_EI @ x_I, meets.T @ Cx - G_I @ x_I)
         x, z_box = np.zeros(free.size), np.zeros(free.size)
-        x[free], x[~free], z_box[~free] = x_E, s.x, s.z_box
+        x[free], x[~free], z_box[~free] = x_E, x_I, s.z_box * root
         y = rows.multipliers(meets @ y_R + others @ s.y)
         return replace(s, x=x, y=y, z_box=z_box)
 
-    columns = 0 if previous is block else int(free.sum())
-    return Eliminated(reduced, recover, rows.G, block, columns)
+    return Eliminated(reduced, recover, int(free.sum()))
 
 
-def _factorised(P_EE: Array, previous: FreeBlock | None) -> FreeBlock | None:
-    if previous is not None and np.array_equal(previous.matrix, P_EE):
-        return previous
-    try:
-        return FreeBlock(P_EE, _cholesky(P_EE))
-    except LinAlgError:  # singular: stationarity does not determine x_E
-        return None
+def _scaled(qp: QP) -> tuple[QP, Vector]:
+    """Return a QP over discs in y = D¹ᐟ²x, and D¹ᐟ² (n,), with D = diag(P).
+
+    If the rows of P have at most k nonzero entries, the condition number of
+    D⁻¹ᐟ²PD⁻¹ᐟ² is at most k times the smallest that a diagonal scaling can reach (van
+    der Sluis, Numer. Math. 14, 1969, 14-23). On a disc, D is the mean over its
+    variables, so that a disc of x becomes a disc of y. Powers of two cause no rounding
+    errors.
+    """
+    P = np.asarray(qp.P)
+    D, discs = P.diagonal().copy(), [d for d in qp.sets if isinstance(d, Discs)]
+    for one in discs:
+        D[one.index] = D[one.index].mean(axis=1, keepdims=True)
+    # along redundant rows, D is zero or a rounding error
+    D = np.maximum(D, SMALLEST_DIAGONAL * D.max(initial=0.0) or 1.0)
+    root = np.exp2(np.round(np.log2(D) / 2))
+    scaled = replace(
+        qp,
+        P=P / root[:, None] / root,
+        q=qp.q / root,
+        A=qp.A / root,
+        sets=(
+            Box(qp.lb * root, qp.ub * root),
+            *(replace(d, radius=d.radius * root[d.index[:, 0]]) for d in discs),
+        ),
+    )
+    return scaled, root
 
 
 def _cholesky(M: Array) -> Array:
@@ -167,26 +175,13 @@ def _cholesky(M: Array) -> Array:
     return np.asarray(factor)
 
 
-def _saddle(block: FreeBlock, G_E: Array) -> _Saddle:
+def _saddle(factor: Array, G_E: Array) -> _Saddle:
     if not len(G_E):
-        return _Saddle(block.factor, G_E, G_E.T, np.zeros((0, 0)))
-    PG = dpotrs(block.factor, G_E.T)[0]
-    return _Saddle(block.factor, G_E, PG, _cholesky(G_E @ PG))
+        return _Saddle(factor, G_E, G_E.T, np.zeros((0, 0)))
+    PG = dpotrs(factor, G_E.T)[0]
+    return _Saddle(factor, G_E, PG, _cholesky(G_E @ PG))
 
 
-def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Array:
-    """Return the block P[rows, columns] of a symmetric P, as a view if possible."""
-    if not isinstance(P, np.ndarray):
-        return np.asarray(csr_array(P)[rows][:, columns].toarray(), dtype=float)
-    at, of = _as_slice(columns), _as_slice(rows)
-    if isinstance(at, slice) and isinstance(of, slice):
-        # in column-major order, for LAPACK
-        return P[at, of].astype(float, copy=False).T
-    return P[np.ix_(columns, rows)].astype(float, copy=False).T
-
-
-def _as_slice(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
-    """Convert a mask to a slice if its true components are consecutive."""
-    at = np.flatnonzero(chosen)
-    whole = at.size and at[-1] - at[0] == at.size - 1
-    return slice(int(at[0]), int(at[-1]) + 1) if whole else chosen
+def _block(P: Array, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Array:
+    """Return the block P[rows, columns] of a symmetric P, in column-major order."""
+    return np.asarray(P[np.ix_(columns, rows)], dtype=float).T

@@ -34,7 +34,6 @@ typedef struct {
     const Py_ssize_t *pair;      /* (n,) the first pair of entries of each column */
     const int *target;           /* entry changed by each pair; -1 if it is dropped */
     const double *below, *diagonal; /* the matrix, stored like L */
-    const double *scale;         /* (n,) S of the inverse S M^-1 S */
     const Py_ssize_t *offset;    /* (count,) offsets of the diagonals, ascending */
     const int *between;          /* diagonal whose offset is the difference of two, or -1 */
     int *from, *to;              /* (runs,) intervals of free components, in the order of
@@ -206,15 +205,14 @@ factorise_incompletely(incomplete *F, in free, double keep, double shift, double
     }
 }
 
-/* y = S v on a run [a, b), minus the products with earlier columns of L. The
+/* y = v on a run [a, b), minus the products with earlier columns of L. The
    recurrence with the entries next to the main diagonal is not included. */
 INLINE void before_forward(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v)
 {
     double *y = F->y;
-    in s = F->scale;
     int second = a >= F->half;
     for (Py_ssize_t i = a; i < b; i++)
-        y[i] = s[i] * v[i];
+        y[i] = v[i];
     for (Py_ssize_t c = 0; c < F->count; c++) {
         Py_ssize_t o = F->offset[c], first, last;
         const double *band = F->bands + c * F->width;
@@ -334,7 +332,7 @@ INLINE void go_on_together(recurrence *c, recurrence *d, double *y)
     go_on(d, y, d->left);
 }
 
-/* y = M^-1 S v with L stored by diagonals. */
+/* y = M^-1 v with L stored by diagonals. */
 INLINE void solve_by_bands(const incomplete *F, in v)
 {
     int chained = F->offset[0] == 1;
@@ -391,7 +389,7 @@ INLINE void solve_by_bands(const incomplete *F, in v)
 
 INLINE void forward_column(const incomplete *F, Py_ssize_t j, in v)
 {
-    double *y = F->y, done = y[j] + F->scale[j] * v[j];
+    double *y = F->y, done = y[j] + v[j];
     y[j] = done;
     for (int k = F->start[j]; k < F->start[j + 1]; k++)
         y[F->row[k]] -= F->L[k] * done; /* L is zero in rows that are not free */
@@ -405,11 +403,10 @@ INLINE void backward_column(const incomplete *F, Py_ssize_t j)
     y[j] = rest;
 }
 
-/* z = S M^-1 S v for a v that is zero off the free set. */
-CLONED static void solve_incompletely(const incomplete *F, in v, out z)
+/* z = s M^-1 v for a v that is zero off the free set. */
+CLONED static void solve_incompletely(const incomplete *F, double s, in v, out z)
 {
     double *y = F->y;
-    in s = F->scale;
     memset(z, 0, F->n * sizeof(double));
     if (F->count) {
         solve_by_bands(F, v);
@@ -431,34 +428,7 @@ CLONED static void solve_incompletely(const incomplete *F, in v, out z)
     }
     for (Py_ssize_t r = 0; r < F->runs; r++)
         for (Py_ssize_t j = F->from[r]; j < F->to[r]; j++)
-            z[j] = s[j] * y[j];
-}
-
-/* Compute the entries of S P S for P stored by rows and a diagonal S, the largest row sum
-   of their absolute values, and the smallest row sums of P and of S P S, each relative
-   to the diagonal entry. */
-CLONED static void
-scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
-              Py_ssize_t n, out row_sums)
-{
-    double norm = 0, least = INFINITY, least_scaled = INFINITY;
-    for (Py_ssize_t i = 0; i < n; i++) {
-        double size = 0, sum = 0, sum_scaled = 0;
-        for (int k = indptr[i]; k < indptr[i + 1]; k++) {
-            double a = s[i] * data[k] * s[indices[k]];
-            scaled[k] = a;
-            size += fabs(a);
-            sum += data[k];
-            sum_scaled += a;
-        }
-        sum *= s[i] * s[i];
-        norm = norm > size ? norm : size;
-        least = least < sum ? least : sum;
-        least_scaled = least_scaled < sum_scaled ? least_scaled : sum_scaled;
-    }
-    row_sums[0] = norm;
-    row_sums[1] = least;
-    row_sums[2] = least_scaled;
+            z[j] = s * y[j];
 }
 
 #endif

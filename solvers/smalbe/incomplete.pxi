@@ -38,41 +38,29 @@ def sparsity(matrix):
     matrix : P (n, n), n > 0, in SciPy's csr or csc format
     """
     cdef Py_ssize_t i, k, n = matrix.shape[0], below, away = 0, others = 0
-    cdef double pairs = 0.0, least = INFINITY, most = 0.0, diagonal
+    cdef double pairs = 0.0, least = INFINITY, most = 0.0, diagonal, size, total
+    cdef double norm = 0.0, least_sum = INFINITY
     cdef list owners = [_integers(matrix.indptr), _integers(matrix.indices)]
     cdef const int *indptr = <const int *> cnp.PyArray_DATA(owners[0])
     cdef const int *indices = <const int *> cnp.PyArray_DATA(owners[1])
     cdef const double *data = read(matrix.data, owners)
     for i in range(n):
-        below, diagonal = 0, 0.0
+        below, diagonal, size, total = 0, 0.0, 0.0, 0.0
         for k in range(indptr[i], indptr[i + 1]):
             below += indices[k] > i
             away += indices[k] - i if indices[k] > i else 0
+            size += fabs(data[k])
+            total += data[k]
             if indices[k] == i:
                 diagonal += data[k]
         if not 0 < diagonal < INFINITY:
-            return INFINITY, 0.0, INFINITY
+            return INFINITY, 0.0, INFINITY, INFINITY, 0.0
+        norm, least_sum = fmax(norm, size), fmin(least_sum, total / diagonal)
         least, most = fmin(least, diagonal), fmax(most, diagonal)
         pairs += below * (below - 1) // 2
         others += below
-    return pairs, n * <double> others / (2 * away) if away else 0.0, most / least
-
-
-def scaled_by_diagonal(matrix, scale):
-    """Return the entries of SPS, and row sums that bound eigenvalues.
-
-    The row sums are the largest row sum of absolute values of SPS, and the smallest row
-    sums of P and of SPS relative to their diagonals. S² is the inverse diagonal of P.
-
-    matrix : P in SciPy's csr format; scale : S (n,)
-    """
-    cdef list owners = []
-    cdef int[::1] indptr = _integers(matrix.indptr), indices = _integers(matrix.indices)
-    cdef double row_sums[3]
-    entries = np.empty(len(matrix.data))
-    scaled_matrix(&indptr[0], &indices[0], read(matrix.data, owners), read(scale, owners),
-                  address(entries), len(scale), row_sums)
-    return entries, row_sums[0], row_sums[1], row_sums[2]
+    levels = n * <double> others / (2 * away) if away else 0.0
+    return pairs, levels, most / least, norm, least_sum
 
 
 @cython.final
@@ -89,13 +77,11 @@ cdef class IncompleteFactor:
     with a positive diagonal. The final values of `keep` and σ are used for all later
     faces.
 
-    The factorised matrix is WPW with a positive diagonal W. With `keep` = 1, its row
-    sums would be preserved. Therefore P should map the vector of weights to zero in the
-    interior of a domain.
+    With `keep` = 1, the row sums of P would be preserved. Therefore P should map the
+    vector of ones to zero in the interior of a domain.
 
     matrix : P in SciPy's csr or csc format, with sorted indices
-    weights : (n,) diagonal of W
-    scale : (n,) diagonal of S; `inverse` applies S M⁻¹ S
+    scale : factor s; `inverse` applies s M⁻¹
     keep : True to add dropped entries, times KEEP, to the diagonal
     """
 
@@ -116,9 +102,10 @@ cdef class IncompleteFactor:
     cdef Py_ssize_t idle
     cdef bint is_ready
     cdef readonly double keep, shift
+    cdef double scale
     cdef readonly long factorisations, solves
 
-    def __init__(self, matrix, weights, scale, bint keep=True):
+    def __init__(self, matrix, double scale=1.0, bint keep=True):
         cdef Py_ssize_t n = matrix.shape[0], i, k, m, entries = 0, pairs = 0, near, used
         cdef Py_ssize_t offset[16]  # MAX_DIAGONALS
         cdef Py_ssize_t count = 0, half, reach = 0, far, column, other, stored
@@ -129,7 +116,6 @@ cdef class IncompleteFactor:
         cdef int[::1] indices = _integers(matrix.indices)
         self.indptr, self.indices = &indptr[0], &indices[0]
         cdef const double *data = read(matrix.data, self.owners)
-        cdef const double *w = read(weights, self.owners)
         # 1. The order of elimination, and the distances of entries from the diagonal.
         for i in range(n):
             for k in range(indptr[i], indptr[i + 1]):
@@ -189,7 +175,7 @@ cdef class IncompleteFactor:
         for i in range(n):
             for k in range(indptr[i], indptr[i + 1]):
                 if indices[k] == i:
-                    diagonal[i] = data[k] * w[i] * w[i]
+                    diagonal[i] = data[k]
                 elif is_later(indices[k], i, half):
                     if by_bands:
                         m = 0
@@ -199,7 +185,7 @@ cdef class IncompleteFactor:
                     else:
                         m, row[entries] = entries, indices[k]
                         entries += 1
-                    below[m] = data[k] * w[i] * w[indices[k]]
+                    below[m] = data[k]
             start[i + 1] = <int> entries
         # 5. The entry that couples two later rows of a column, if it exists. This entry
         # is stored in the column of the row that is eliminated first.
@@ -229,7 +215,7 @@ cdef class IncompleteFactor:
         self.F.width, self.F.offset, self.F.between = n + reach, &at_offset[0], between
         self.F.start, self.F.row, self.F.target = start, row, target
         self.F.pair, self.F.below, self.F.diagonal = self.first_pairs, below, diagonal
-        self.F.scale = read(scale, self.owners)
+        self.scale = scale
         self.F.L = self.F.bands = self.room.at
         self.F.pivot = self.F.L + stored
         self.F.inverse = self.F.pivot + n + reach
@@ -274,9 +260,9 @@ cdef class IncompleteFactor:
         return 0
 
     cdef void inverse(self, const double *v, double *z) noexcept:
-        """z ← S M⁻¹ S v for a v that is zero off the face."""
+        """z ← s M⁻¹ v for a v that is zero off the face."""
         cdef Py_ssize_t i
-        solve_incompletely(&self.F, v, z)
+        solve_incompletely(&self.F, self.scale, v, z)
         self.solves += 1
         for i in range(self.idle):
             z[self.besides[i]] = 0.0
@@ -299,7 +285,7 @@ cdef class IncompleteFactor:
         return count
 
     def solve(self, free, v):
-        """Return S M⁻¹ S v (n,) on the face with the mask `free` (n,), else zero."""
+        """Return s M⁻¹ v (n,) on the face with the mask `free` (n,), else zero."""
         result, face = np.empty(self.n), np.asarray(free, dtype=float)
         masked_v = _whole(np.where(free, v, 0.0))
         self.enter(address(face))

@@ -286,21 +286,43 @@ cdef class Rows:
         return self.are_met(address(nu), Cnu.at, tol, least)
 
     cdef int fit(self, const double *free, double *r, double *a) except -1:
-        """a ← the result of `fitted`, for sparse rows.
+        """a ← the result of `fitted`.
+
+        Eigenvalues of C_F C_Fᵀ below FREE_RANK count as zero. Normal equations double
+        the number of lost digits, so that dense rows are fitted twice, the second time
+        to the residual.
 
         free : (n,) 1 for free components, else 0
-        r : (n,) argument of `fitted`; entries of other components are set to zero
+        r : (n,) argument of `fitted`, overwritten
         """
-        cdef Py_ssize_t i
-        for i in range(self.n):
-            r[i] *= free[i]
-        self.coarse.times(r, self.coarse.t)
-        self.coarse.enter(free)
-        self.coarse.in_face(FREE_RANK).solve_to(self.coarse.t, self.coarse.y)
+        cdef Py_ssize_t i, j
+        cdef int order = self.r, one = 1, info = 0
+        cdef Room room
+        cdef double *S
+        cdef double *t
+        masked(free, r, r, self.n)
+        if self.coarse is not None:
+            self.coarse.times(r, self.coarse.t)
+            self.coarse.enter(free)
+            self.coarse.in_face(FREE_RANK).solve_to(self.coarse.t, self.coarse.y)
+            scale(-1.0, self.coarse.y, self.r)
+            self.coarse.product(self.coarse.y, self.coarse.t)
+            self.coarse.forward(self.coarse.t, a)
+            return 0
+        room = Room((self.r + 1) * (self.r + self.n))
+        S, t = room.at, room.at + self.r * self.r
         for i in range(self.r):
-            self.coarse.y[i] = -self.coarse.y[i]
-        self.coarse.product(self.coarse.y, self.coarse.t)
-        self.coarse.forward(self.coarse.t, a)
+            masked(free, self.C + i * self.n, t, self.n)
+            rows_times(self.C, t, S + i * self.r, i + 1, self.n)
+            S[i * self.r + i] += FREE_RANK
+        dpotrf(b"U", &order, S, &order, &info)
+        memset(a, 0, self.r * sizeof(double))
+        for i in range(2):
+            rows_times(self.C, r, t, self.r, self.n)
+            dpotrs(b"U", &order, &one, S, &order, t, &order, &info)
+            add(-1.0, t, a, self.r)
+            add_combination(-1.0, self.C, t, r, self.r, self.n)
+            masked(free, r, r, self.n)
         return 0
 
     def fitted(self, free, r):

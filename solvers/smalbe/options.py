@@ -22,7 +22,6 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 #: step would leave the set (1). With discs, the value model selects spectral, because
 #: the model is minimised only over boxes
 Expansion = Literal["model", "spectral"]
-Eliminate = Literal["never", "sequences", "always"]
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,6 @@ class Options:
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     # n/10 is the limit without equality rows
     lanczos_steps: int = 12  #: limit of Lanczos steps; at most n/6 or n/10, at least 5
-    # only with the preconditioners model and none; others require the original P
-    eliminate: Eliminate = "sequences"  #: when to eliminate free variables
     history: bool = False  #: True to record each step
     max_steps: int = 200_000  #: limit of MPRGP steps plus outer iterations
 
@@ -68,14 +65,13 @@ class Options:
         choices = {
             "expansion": get_args(Expansion),
             "preconditioner": PRECONDITIONERS,
-            "eliminate": get_args(Eliminate),
         }
         for name, known in choices.items():
             check_choice(name, getattr(self, name), known)
         if self.is_extended and self.preconditioner == "incomplete":
             raise ValueError(
-                "preconditioner = 'incomplete' works in scaled variables, which the "
-                "functions of a subclass do not expect; expected another one"
+                "preconditioner = 'incomplete' replaces the functions of a subclass; "
+                "expected another one"
             )
 
     def preconditioner_for(self, qp: QP) -> Operator | None:

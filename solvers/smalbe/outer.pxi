@@ -473,76 +473,71 @@ cdef class SMALBE(MPRGP):
     def point(self, nu, mu, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
-        The computation is the same as in `solvers.smalbe.driver.recovered`, but uses
-        normal equations for the correction of a. The result is None if there are discs,
-        or if the rows of a dense C are so nearly dependent on the free components that
-        normal equations would be inaccurate.
+        For a = ‖𝒫F𝒫‖μ − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient of the
+        projected problem up to rounding and terms of the order of ‖Cν‖. On the free
+        components, where the residual must vanish, a least-squares correction of a
+        removes these errors.
         """
-        cdef Py_ssize_t i, n = self.n, r = self.rows.r
-        cdef int order = r, one = 1, info = 0
+        cdef Py_ssize_t i, j, k, n = self.n, r = self.rows.r
         cdef bint any_left = False
         cdef list owners = []
-        if self.set.has_discs:
-            return None
+        cdef Parts parts
         restored_x, multipliers, boxes, product = empty(n), zeros(r), zeros(n), empty(n)
-        cdef Room room = Room(r * r if self.rows.C else 0)
-        cdef double *S = room.at
-        cdef const double *C = self.rows.C
-        cdef const double *v = address(nu)
-        cdef const double *at_mu = address(mu)
+        cdef const double *v = read(nu, owners)
+        cdef const double *at_mu = read(mu, owners)
+        cdef const double *least = read(lb, owners)
+        cdef const double *most = read(ub, owners)
         cdef double *a = address(multipliers)
         cdef double *x = address(restored_x)
         cdef double *z_box = address(boxes)
         cdef double *Fx = address(product)
         cdef double *rest = self.s
         cdef double *free = self.x2
-        cdef double *t = self.t
         cdef double *da = self.Cv
-        cdef const double *least = read(lb, owners)
-        cdef const double *most = read(ub, owners)
+        cdef double square, push
+        self.set.split(v, v, 1.0, self.t, free, &parts)
         for i in range(n):  # x̃ + ν may differ from a bound in the last bit
             x[i] = fmin(fmax(self.rows.x_tilde[i] + v[i], least[i]), most[i])
             if v[i] >= self.upper[i]:
                 x[i] = most[i]
             if v[i] <= self.lower[i]:
                 x[i] = least[i]
-            free[i] = self.lower[i] < v[i] < self.upper[i]
+        for i in range(self.set.n_discs):
+            square = 0.0
+            for k in range(self.set.start[i], self.set.start[i + 1]):
+                square += x[self.set.index[k]] ** 2
+            if square > self.set.radius[i] ** 2:
+                for k in range(self.set.start[i], self.set.start[i + 1]):
+                    x[self.set.index[k]] *= self.set.radius[i] / sqrt(square)
         self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
             any_left = any_left or rest[i] != 0
-        if any_left and self.rows.coarse is not None:
-            self.rows.times(rest, da)
-            for i in range(r):
-                a[i] = self.norm * at_mu[i] - da[i]
-            self.rows.combine(1.0, a, rest, rest)
-            memcpy(t, rest, n * sizeof(double))
-            self.rows.fit(free, t, da)
+        if not any_left:  # x is the unconstrained minimiser
+            return restored_x, multipliers, boxes, product
+        self.rows.times(rest, da)
+        for i in range(r):
+            a[i] = self.norm * at_mu[i] - da[i]
+        self.rows.add(1.0, a, rest)
+        if r:
+            memcpy(self.t, rest, n * sizeof(double))
+            self.rows.fit(free, self.t, da)
+            self.rows.add(1.0, da, rest)
             for i in range(r):
                 a[i] += da[i]
-            self.rows.combine(1.0, da, rest, rest)
-        elif any_left and r:
-            rows_times(C, rest, da, r, n)
-            for i in range(r):
-                a[i] = self.norm * at_mu[i] - da[i]
-            add_combination(1.0, C, a, rest, r, n)
-            for i in range(r):
-                masked(free, C + i * n, t, n)
-                rows_times(C, t, S + i * r, i + 1, n)
-            masked(free, rest, t, n)
-            rows_times(C, t, da, r, n)
-            dpotrf(b"U", &order, S, &order, &info)
-            for i in range(r):
-                if info or S[i * r + i] < 1e-4:
-                    return None
-            dpotrs(b"U", &order, &one, S, &order, da, &order, &info)
-            for i in range(r):
-                a[i] -= da[i]
-            add_combination(-1.0, C, da, rest, r, n)
-        if any_left:  # otherwise x is the unconstrained minimiser
-            for i in range(n):
-                if v[i] <= self.lower[i]:
-                    z_box[i] = -fmax(rest[i], 0.0)
-                if v[i] >= self.upper[i]:
-                    z_box[i] -= fmin(rest[i], 0.0)
+        for i in range(n):
+            if v[i] <= self.lower[i]:
+                z_box[i] = -fmax(rest[i], 0.0)
+            if v[i] >= self.upper[i]:
+                z_box[i] -= fmin(rest[i], 0.0)
+        for i in range(self.set.n_discs):  # outward normal part of −rest
+            square = push = 0.0
+            for k in range(self.set.start[i], self.set.start[i + 1]):
+                j = self.set.index[k]
+                square += x[j] * x[j]
+                push += x[j] * rest[j]
+            for k in range(self.set.start[i], self.set.start[i + 1]):
+                j = self.set.index[k]
+                if free[j] == 0:  # every vector is normal to a disc of radius zero
+                    z_box[j] = -fmin(push, 0.0) / square * x[j] if square else -rest[j]
         return restored_x, multipliers, boxes, product

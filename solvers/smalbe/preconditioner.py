@@ -1,7 +1,7 @@
 """Preconditioners of the CG steps on a face of the box.
 
 The preconditioner `model` is inverted on each face (model.pxi), and `incomplete` is
-factorised on each face (incomplete.pxi; `solvers.smalbe.scaled`). All other
+factorised on each face (incomplete.pxi). All other
 preconditioners use the same matrix M for all faces, restricted to the free components
 of the face: z = Mφ with the free gradient φ. For a dual with F = BK⁺Bᵀ, the structural
 preconditioners are
@@ -37,7 +37,7 @@ from scipy.sparse import csc_matrix, diags_array, issparse
 
 from mortarbench.harness import QP, Structure
 from mortarbench.harness.operators import Preconditioned, preconditioned
-from mortarbench.solvers.smalbe.compiled import sparsity
+from mortarbench.solvers.smalbe.compiled import IncompleteFactor, sparsity
 from mortarbench.solvers.smalbe.extension import Operator
 from mortarbench.solvers.smalbe.rows import Mask
 
@@ -60,16 +60,8 @@ MAX_PAIRS = 2.0
 #: factor takes at most a quarter longer (a flat obstacle, n = 110) and saves up to
 #: 97 %.
 MIN_DIFFICULTY = 50.0
-#: smallest spread for which a factor is used for any number of levels; journal bearings
-#: with an eccentricity of 0.9 have spreads of 2000 to 7000
-MIN_SPREAD = 1000.0
-#: largest spread for which variables are not scaled, because scaling takes as long as
-#: several products
-MAX_UNSCALED = 2.0
-#: smallest spread·n for which variables are scaled if no factor is used; below this
-#: value, as in journal bearings of 100 to 400 unknowns, scaling takes longer than the
-#: products that it saves
-MIN_SCALED = 1e5
+#: a negative row sum Σⱼ Pᵢⱼ counts as zero if it is at least this factor times −Pᵢᵢ
+ROUNDING = 1e-12
 #: relative increase of diag(BWBᵀ), because B may contain repeated rows
 DEPENDENT = 1e-10
 
@@ -94,15 +86,12 @@ class Sparsity(NamedTuple):
     #: and 0 for a diagonal P
     levels: float
     spread: float  #: ratio of the largest to the smallest diagonal entry
+    norm: float  #: largest sum Σⱼ|Pᵢⱼ| of a row, an upper bound on ‖P‖ (Gershgorin)
+    least: float  #: smallest sum Σⱼ Pᵢⱼ of a row, relative to Pᵢᵢ
 
 
 def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
-    """Replace ``auto`` by the kind that `resolved` selects."""
-    return resolved(qp, kind)[0]
-
-
-def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
-    """Return the preconditioner for `kind`, and True if variables should be scaled.
+    """Replace ``auto`` by the preconditioner that is fastest for `qp`.
 
     A CG step with an incomplete factor costs four to seven times as much as a step
     without a factor. The factor therefore saves time if CG without a factor takes more
@@ -110,20 +99,26 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
     fourth root of `Sparsity.spread`. The choice of ``auto`` is dirichlet if P is an
     operator that provides it, otherwise incomplete if it saves time, otherwise model.
     """
-    if kind not in ("auto", "incomplete"):
-        return kind, False
-    if kind == "incomplete":
-        return kind, True
+    if kind != "auto":
+        return kind
     if isinstance(qp.P, np.ndarray):
-        return "model", False
+        return "model"
     if preconditioned_operator(qp):
-        return "dirichlet", False
-    if not _is_sparse(qp) or (P := _sparsity(qp)).pairs == np.inf:
-        return "model", False
-    pays = P.levels * P.spread**0.25 >= MIN_DIFFICULTY or P.spread >= MIN_SPREAD
-    if pays and P.pairs <= MAX_PAIRS * qp.P.nnz:
-        return "incomplete", True
-    return "model", P.spread * qp.q.size >= MIN_SCALED
+        return "dirichlet"
+    if not _is_sparse(qp) or (P := _sparsity(qp)).pairs > MAX_PAIRS * qp.P.nnz:
+        return "model"
+    pays = P.levels * P.spread**0.25 >= MIN_DIFFICULTY
+    return "incomplete" if pays else "model"
+
+
+def incomplete_factor(qp: QP) -> tuple[float, IncompleteFactor]:
+    """Return a bound on ‖P‖ and the incomplete factor of P divided by this bound.
+
+    Dropped entries are added to the diagonal only if no row sum of P is negative, apart
+    from rounding: P then maps the vector of ones to zero in the interior of a domain.
+    """
+    P = _sparsity(qp)
+    return P.norm, IncompleteFactor(qp.P, P.norm, P.least >= -ROUNDING)
 
 
 def has_sparse_factor(qp: QP) -> bool:

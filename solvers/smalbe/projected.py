@@ -25,6 +25,9 @@ from mortarbench.solvers.smalbe.rows import (
 )
 from mortarbench.solvers.smalbe.spectrum import Ritz, random_start
 
+#: largest component of Ritz vectors along rows that counts as rounding
+ORTHOGONAL = 1e-12
+
 
 class Spectrum(NamedTuple):
     """Norm and upper end of the spectrum of 𝒫F𝒫."""
@@ -38,6 +41,9 @@ class Spectrum(NamedTuple):
         For sparse rows, the spectrum is returned unchanged.
         """
         if self.ritz is None or not isinstance(rows, DenseRows):
+            return self
+        along = rows.C @ self.ritz.vectors.T
+        if np.abs(along).max(initial=0.0) <= ORTHOGONAL:
             return self
         V, R = np.linalg.qr(rows.project(self.ritz.vectors.T))
         vectors = np.ascontiguousarray((V * np.sign(np.diag(R))).T)
@@ -60,7 +66,7 @@ class Projected:
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
     #: preconditioner on the face; None to use the option `preconditioner`
     preconditioner: Preconditioner | None = None
-    #: incomplete factor of the free block of a sparse F in scaled variables, or None
+    #: incomplete factor of the free block of a sparse F, or None
     factor: compiled.IncompleteFactor | None = None
     discs: tuple[Discs, ...] = ()  #: discs of x, not of ν
     semidefinite: bool = False  #: True if F has a kernel, see `is_semidefinite`

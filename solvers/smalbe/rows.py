@@ -17,7 +17,7 @@ requires only a factorisation of their Schur complement
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -86,9 +86,9 @@ class Rows(ABC):
         """Return s·v + t·Cᵀa."""
         return s * v + t * (self.C.T @ a)
 
-    @abstractmethod
     def fitted(self, free: Mask, r: Vector) -> Vector:
         """Return the minimiser a (r,) of ‖(r + Cᵀa)_F‖ on the free components F."""
+        return compiled.Rows(self).fitted(free, r)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +97,6 @@ class DenseRows(Rows):
 
     C: NDArray[np.float64]
     GC: NDArray[np.float64]  #: GCᵀ (m, r), so that Gx − e = GCᵀ C(x − x̃)
-
-    def fitted(self, free: Mask, r: Vector) -> Vector:
-        a, *_ = np.linalg.lstsq(self.C.T[free], -r[free], rcond=FREE_RANK)
-        return np.asarray(a)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +135,6 @@ class SparseRows(Rows):
                 shift = min(
                     100 * shift, 1.0
                 )  # the loop ends at shift = 1 at the latest, since GGᵀ has a factor
-
-    def fitted(self, free: Mask, r: Vector) -> Vector:
-        return compiled.Rows(self).fitted(free, r)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,7 @@ class SMALBE(Options):
     """In-house SMALBE with MPRGP for bounds and equality rows.
 
     SMALBE needs only products with P. It also accepts discs, which bound friction
-    forces in three dimensions. With discs and a dense P, variables without constraints
-    are first eliminated by a Cholesky factor.
+    forces in three dimensions.
 
     The solver stops when the relative KKT residual of the QP is at most tol.
     """
@@ -48,12 +47,10 @@ class SMALBE(Options):
         licence="BSD-3-Clause",
         method="augmented Lagrangian with an inner active-set method (MPRGP)",
         linear_solver="none (products with P, small dense systems of the model, "
-        "incomplete factors of a sparse P; with discs and in sequences, a Cholesky "
-        "factor of the free block of P)",
+        "incomplete factors of a sparse P)",
         phases="orthonormalisation of rows and Lanczos process (preparing); iterations "
         "(solving)",
-        sequence="reuses the point, multipliers, Ritz pairs and the factor of the "
-        "free block",
+        sequence="reuses the point, multipliers and Ritz pairs",
         limits=(
             "QPs with inequality rows are declined; dual forms have no inequality "
             "rows.",
@@ -77,8 +74,7 @@ class SMALBE(Options):
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         """Start a sequence in which each solve reuses results of the previous one.
 
-        The reused results are the point, the multipliers, the Ritz pairs and the factor
-        of the free block.
+        The reused results are the point, the multipliers and the Ritz pairs.
         """
         carry: Carry | None = None
 
@@ -94,6 +90,3 @@ class SMALBE(Options):
             return run
 
         return prepare
-
-
-CONDENSED = SMALBE(eliminate="always")

@@ -10,7 +10,6 @@ from mortarbench.solvers.smalbe.driver import COLUMNS, STEPS
 
 PRESETS = [
     "smalbe",
-    "smalbe-condensed",
     "smalbe-permon",
     "smalbe-espreso",
     "smalbe-paper",

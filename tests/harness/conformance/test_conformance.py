@@ -98,7 +98,7 @@ UNBOUNDED = "claims no success: unbounded"
 MEMBRANE = "finds where a membrane of 400 nodes touches"
 #: checks in which a solver takes seconds, mostly to reach its iteration limit
 LONG = [
-    ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
+    ("proxqp", UNBOUNDED),
     ("projected-gradient", UNBOUNDED), ("nsgs", MEMBRANE),
 ]  # fmt: skip
 #: one solver for each type of constraints that our solvers accept, one adapter of a

@@ -62,7 +62,7 @@ class WithRule(SMALBE):
         return self.rule
 
 
-PLAIN = dict(recycle=False, eliminate="never")
+PLAIN = dict(recycle=False)
 
 
 def test_the_inverse_as_preconditioner_needs_one_cg_step():
@@ -192,7 +192,6 @@ def test_a_rule_that_returns_no_point_is_refused(rule, message):
 
 
 def test_in_a_sequence_the_functions_receive_every_variable():
-    """Without user functions, free variables are eliminated from the second QP on."""
     n, sizes = 30, []
     lb = np.where(np.arange(n) < 10, -np.inf, 0.0)
     qps = [bounded(spd(n, 6), np.linspace(-1, k, n), lb) for k in (1, 2, 3)]
@@ -212,19 +211,15 @@ def test_in_a_sequence_the_functions_receive_every_variable():
 
 @pytest.mark.parametrize("kind", [WithM, WithRule])
 def test_incomplete_factors_are_refused_not_ignored(kind):
-    """Incomplete factors scale the variables. With `auto`, another preconditioner is
+    """With `auto`, another preconditioner is
     used instead.
     """
-    with pytest.raises(
-        ValueError, match="preconditioner = 'incomplete' works in scaled"
-    ):
+    with pytest.raises(ValueError, match="preconditioner = 'incomplete' replaces"):
         kind(preconditioner="incomplete")
 
 
 def test_a_step_rule_receives_a_sparse_qp_in_its_original_variables():
-    """`auto` would scale the variables; the rule receives x and the bounds in the
-    user's variables.
-    """
+    """`auto` would use a factor; the rule receives x and the bounds."""
     n, steps = 60, []
     P = 1e4 * csr_array(2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
     qp = bounded(P, np.linspace(-3, -1, n), np.full(n, -1.0), np.full(n, 5e-3))

@@ -16,8 +16,6 @@ from mortarbench.solvers.smalbe.driver import outer_loop
 from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-BETWEEN = dict(eliminate="never")
-
 
 def chain(n):
     """Return the stiffness of n springs in series, fixed at the left end."""
@@ -121,7 +119,7 @@ def test_preconditioned_solves_converge_and_applications_are_counted(form, kind)
     family = PROBLEMS["beam-ring"]
     configured = family.with_keys(Nr=4, Nh=3)
     qp = configured.build(form, reference_solution).qp
-    s = SMALBE(preconditioner=kind, **BETWEEN).prepare(qp, 1e-8)()
+    s = SMALBE(preconditioner=kind).prepare(qp, 1e-8)()
 
     assert s.status is Status.SOLVED
     assert kkt_residuals(qp, s).worst <= 1e-7

@@ -210,7 +210,7 @@ def test_the_same_steps_lead_to_the_same_point(G, e, monkeypatch, preconditioner
         P=W @ W.T + np.eye(40), q=rng.normal(size=40), A=G, b=e, G=no_rows(40),
         h=np.zeros(0), lb=np.linspace(-1, 2, 40) - 0.3, ub=np.full(40, np.inf),
     )  # fmt: skip
-    solver = SMALBE(preconditioner=preconditioner, eliminate="never", lanczos_steps=1)
+    solver = SMALBE(preconditioner=preconditioner, lanczos_steps=1)
     dense = solver.prepare(qp, 1e-8)()
     monkeypatch.setattr(module, "MAX_DENSE_ENTRIES", 0)
     sparse = solver.prepare(qp, 1e-8)()

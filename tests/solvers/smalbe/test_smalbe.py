@@ -237,8 +237,7 @@ def test_the_model_uses_the_lanczos_process_and_the_rows(dual):
     "wrong",
     [dict(rho=-1.0), dict(rho=np.inf), dict(M=0.0), dict(beta=1.0), dict(beta=2.0),
      dict(Gamma=-1.0), dict(lanczos_steps=0), dict(max_steps=-1), dict(alpha=2.1),
-     dict(expansion="gp"), dict(preconditioner="ilu"),
-     dict(eliminate="yes")],
+     dict(expansion="gp"), dict(preconditioner="ilu")],
     ids=str,
 )  # fmt: skip
 def test_options_that_cannot_work_are_refused(wrong):
@@ -561,7 +560,7 @@ def mixed(P, q, lb, ub, A, b):
     return bounded(P, q, A, b, lb=np.asarray(lb), ub=np.asarray(ub))
 
 
-@pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed", "smalbe-direct"])
+@pytest.mark.parametrize("name", ["smalbe", "smalbe-direct"])
 @pytest.mark.parametrize(
     "qp",
     [
