@@ -26,7 +26,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAN = ROOT / "tests" / "mutants.toml"
@@ -38,7 +38,9 @@ _PAIRS = (
     (ast.And, ast.Or), (ast.Lt, ast.GtE), (ast.Gt, ast.LtE), (ast.Eq, ast.NotEq),
     (ast.Is, ast.IsNot), (ast.In, ast.NotIn),
 )  # fmt: skip
-OPERATORS = {a: b for pair in _PAIRS for a, b in (pair, pair[::-1])}
+OPERATORS: dict[type[ast.AST], Any] = {
+    a: b for pair in _PAIRS for a, b in (pair, pair[::-1])
+}
 _NAMES = (
     ("min", "max"), ("minimum", "maximum"), ("any", "all"), ("floor", "ceil"),
     ("argmin", "argmax"),

@@ -580,7 +580,8 @@ def _solve_to_tolerance(
         return Solution.without_point(qp, Status.INFEASIBLE, message)
     x = problem.omega.project(np.zeros(qp.q.size))
     if not problem.size:
-        problem.size = float(np.linalg.norm(problem.product(options.rho, x)))
+        start = problem.product(options.rho, x) - options.rho * rows.C.T @ problem.c
+        problem.size = float(np.linalg.norm(start))
     at = State(x, np.zeros(problem.c.size), options.M, options.rho)
     while True:
         at = smalbe(problem, at, options, tighter * tol, history)

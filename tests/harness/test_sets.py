@@ -79,6 +79,45 @@ def test_the_support_function_bounds_the_work_on_every_member(one, rng):
 
 
 @names
+def test_exactly_members_have_no_negative_slack(one, rng):
+    for x in [*points(rng, 50), *map(one.project, points(rng, 50))]:
+        slack = min(limit.slack.min() for limit in one.limits(x))
+        assert (slack < 0) == (np.abs(one.project(x) - x).max() > 0) or abs(
+            slack
+        ) < 1e-14
+
+
+@pytest.mark.parametrize("one", SETS[2:], ids=NAMES[2:])
+def test_no_member_is_beyond_a_tangent_plane(one, rng):
+    """nᵀ(y − x) ≤ slack for all members y; a plane at the boundary has no slack."""
+    members = np.array([one.project(y) for y in points(rng)])
+    for v in points(rng, 50):
+        x = one.project(v)
+        normals, slack = one.normals(x)
+        assert ((members - x) @ normals <= slack + 1e-12).all()
+        blocks, k = one.index, len(one.index)
+        moved = (x != v)[blocks].any(axis=1) & (x[blocks[:, -1]] != 0)  # not at an apex
+        assert np.abs(slack[:k][moved]).max(initial=0) <= 1e-14
+        length = np.sqrt((normals.toarray() ** 2).sum(axis=0))
+        assert length[:k][moved] == pytest.approx(1)
+
+
+def test_bounds_are_substituted_with_their_variables(rng):
+    """x = Tx' is in the box exactly if x' is in the other one."""
+    T = csr_array(
+        (rng.choice([-4.0, -0.5, 2.0], N), (np.arange(N), rng.permutation(N)))
+    )
+    other = BOX.substituted(T, np.zeros(N))
+
+    assert BOX.block.tolist() == [0, 1, 2, 4, 5, 6, 7]
+    for x in points(rng, 50):
+        for point in (T @ x, BOX.project(T @ x)):
+            back = np.linalg.solve(T.toarray(), point)
+            inside = (BOX.project(point) == point).all()
+            assert inside == (other.project(back) == back).all()
+
+
+@names
 def test_inadmissible_vectors_have_unbounded_work(one, rng):
     """σ(z) = ∞ for each vector z = ±eⱼ whose admissible part is zero."""
     e = np.eye(N)

@@ -131,15 +131,31 @@ def test_a_face_is_left_if_the_chopped_gradient_exceeds_gamma_times_the_free_one
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_outer_loop_by_hand(name):
-    """Minimise ½‖x‖² over x₁ + x₂ = 2: H = I for ρ = 1, and one step solves."""
+    """Minimise ½‖x‖² over x₁ + x₂ = 2: H = I for ρ = 1, and one step solves. Since
+    b = 0, η refers to the first gradient; with η = 1, no step would be taken.
+    """
     qp = QP.from_arrays(np.eye(2), [0, 0], A=[1, 1], b=2)
-    solver = replace(SOLVERS[name], rho=1.0, norm="lanczos")
+    solver = replace(SOLVERS[name], rho=1.0, norm="lanczos", eta=0.1)
     s = solver.prepare(qp, 1e-8)()
 
     assert s.status is Status.SOLVED
     assert (s.counts["cg"], s.counts["outer"]) == (1, 1)
     assert s.x == pytest.approx([1, 1])
     assert s.y == pytest.approx([-1])
+
+
+def test_a_growing_penalty_takes_fewer_outer_iterations():
+    """Minimise ½‖x‖² over x₁ + x₂ = 1, x₁ ≤ 0.2: x = (0.2, 0.8) and y = −0.8."""
+    qp = QP.from_arrays(np.eye(2), [0, 0], A=[1, 1], b=1, ub=[0.2, np.inf])
+    outer = []
+    for growth in (1.0, 2.0, 10.0):
+        s = Textbook(rho=0.1, late_growth=growth).prepare(qp, 1e-8)()
+        assert s.status is Status.SOLVED
+        assert s.x == pytest.approx([0.2, 0.8])
+        assert s.y == pytest.approx([-0.8])
+        outer.append(s.counts["outer"])
+
+    assert outer[2] < outer[1] < outer[0]
 
 
 def test_multipliers_converge_at_the_rate_of_the_method_of_multipliers():
