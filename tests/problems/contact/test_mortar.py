@@ -280,6 +280,13 @@ def test_the_forces_of_a_row_are_in_equilibrium(basis):
     assert np.abs(forces).max() > 0.5
 
 
+def test_tangential_rows_are_those_of_normals_turned_by_a_right_angle():
+    B, _, T, *_ = rows(*arcs(20), tangential=True)
+    x, y = np.moveaxis(B.toarray().reshape(B.shape[0], -1, 2), 2, 0)
+
+    assert (T.toarray() == np.stack([-y, x], axis=-1).reshape(B.shape)).all()
+
+
 @pytest.mark.parametrize("basis", BASES)
 @pytest.mark.parametrize("n", [5, 40])
 def test_on_curved_sides_the_forces_of_a_row_have_no_moment(n, basis):
