@@ -580,7 +580,8 @@ def _solve_to_tolerance(
         return Solution.without_point(qp, Status.INFEASIBLE, message)
     x = problem.omega.project(np.zeros(qp.q.size))
     if not problem.size:
-        start = problem.product(options.rho, x) - options.rho * rows.C.T @ problem.c
+        start = problem.product(options.rho, x)
+        start = start - rows.C.T @ (options.rho * problem.c)
         problem.size = float(np.linalg.norm(start))
     at = State(x, np.zeros(problem.c.size), options.M, options.rho)
     while True:
