@@ -26,44 +26,18 @@ from mortarbench.harness import (
 )
 from mortarbench.solvers.common.backends import (
     BackendAdapter,
-    Call,
     adapter_files,
+    call_of,
     reason_unavailable,
 )
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     DIVERGED,
-    NEGLIGIBLE,
     ConicForm,
     csc,
     objective_factor,
     to_cone,
 )
-
-#: arguments for each backend; a backend that is not listed runs with cvxpy's defaults
-CALLS: Mapping[str, Call] = {
-    "CLARABEL": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
-    "DAQP": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
-    "HIGHS": Call(
-        ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
-        # by default HiGHS adds 1e-7 to the Hessian and drops entries below 1e-9
-        {"qp_regularization_value": 0.0, "small_matrix_value": 1e-12, "threads": 1},
-        size=1.0,
-        tighter=1e-2,
-        floor=1e-10,
-    ),
-    "OSQP": Call(
-        ("eps_rel",),
-        {"eps_abs": NEGLIGIBLE, "max_iter": 1_000_000, "polishing": False},
-    ),
-    "PIQP": Call(
-        ("eps_rel", "eps_duality_gap_rel"),
-        {"eps_abs": NEGLIGIBLE, "eps_duality_gap_abs": NEGLIGIBLE},
-    ),
-    "QOCO": Call(("reltol", "reltol_inacc"), {"abstol": NEGLIGIBLE}),
-    "QPALM": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
-    "SCS": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
-}
 
 SECOND_ORDER = ("CLARABEL", "QOCO", "SCS")  #: backends that accept discs and cones
 CONIC = "cvxpy passes QPs to it as cone programs, which costs half of the digits"
@@ -91,14 +65,14 @@ CLAIMS = {
 class CVXPY(BackendAdapter):
     """One backend of cvxpy.
 
-    The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
-    a stopping test is the sum of an absolute and a relative term, `tol` is the relative
-    tolerance and the absolute tolerance is negligible. A backend without an entry in
-    `CALLS` runs with cvxpy's defaults. The objective is scaled to ‖q‖∞ = 1e4, or to
-    ‖q‖∞ = 1 if the backend's test is absolute (HIGHS, DAQP). The adapter declines all
-    QPs for CVXOPT and ECOS, which would receive them as cone programs, for backends
-    that solve linear programs only, and for ProxQP, because cvxpy cannot enable
-    ProxQP's test of the duality gap.
+    The tolerance is passed in the backend's own keywords (`solvers.common.backends`).
+    If the threshold of a stopping test is the sum of an absolute and a relative term,
+    `tol` is the relative tolerance and the absolute tolerance is negligible. A backend
+    that is not listed there runs with cvxpy's defaults. The objective is scaled to ‖q‖∞
+    = 1e4, or to ‖q‖∞ = 1 if the backend's test is absolute (HIGHS, DAQP). The adapter
+    declines all QPs for CVXOPT and ECOS, which would receive them as cone programs, for
+    backends that solve linear programs only, and for ProxQP, because cvxpy cannot
+    enable ProxQP's test of the duality gap.
     """
 
     about: ClassVar[About] = About(
@@ -140,7 +114,7 @@ class CVXPY(BackendAdapter):
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import cvxpy
 
-        call, form = CALLS.get(self.backend, Call()), to_cone(qp)
+        call, form = call_of(self.backend), to_cone(qp)
         options = self.tuned(**call.options(tol))
         scale = objective_factor(qp, call.size)
         problem, x, constraints = _model(cvxpy, qp, form, scale)

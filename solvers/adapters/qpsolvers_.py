@@ -28,58 +28,17 @@ from mortarbench.harness import (
 )
 from mortarbench.solvers.common.backends import (
     BackendAdapter,
-    Call,
     adapter_files,
+    call_of,
     reason_unavailable,
 )
 from mortarbench.solvers.common.conversion import (
-    NEGLIGIBLE,
     csc,
     dense,
     needs_dense,
     objective_factor,
     on_present_bounds,
 )
-
-#: arguments for each backend; a backend that is not listed runs with its defaults
-CALLS: Mapping[str, Call] = {
-    "clarabel": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
-    "cvxopt": Call(("feastol", "abstol", "reltol")),
-    "daqp": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
-    "highs": Call(
-        ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
-        # by default HiGHS adds 1e-7 to the Hessian and drops entries below 1e-9
-        {
-            "qp_regularization_value": 0.0,
-            "small_matrix_value": 1e-12,
-            "threads": 1,
-            "qp_iteration_limit": 1_000_000,  # without a limit, HiGHS may cycle
-        },
-        size=1.0,
-        tighter=1e-2,
-        floor=1e-10,
-    ),
-    "osqp": Call(
-        ("eps_rel",),
-        {"eps_abs": NEGLIGIBLE, "max_iter": 1_000_000, "raise_error": False},
-    ),
-    "piqp": Call(
-        ("eps_rel", "eps_duality_gap_rel"),
-        {"eps_abs": NEGLIGIBLE, "eps_duality_gap_abs": NEGLIGIBLE},
-    ),
-    "proxqp": Call(
-        ("eps_rel", "eps_duality_gap_rel"),
-        {
-            "eps_abs": NEGLIGIBLE,
-            "eps_duality_gap_abs": NEGLIGIBLE,
-            "check_duality_gap": True,
-        },
-    ),
-    "qpalm": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
-    "qtqp": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel")),
-    "scs": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
-    "sip": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
-}
 
 #: backends that accept dense matrices only
 DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")
@@ -106,12 +65,12 @@ STATUS_PATTERNS = (
 class QPSolvers(BackendAdapter):
     """One backend of qpsolvers.
 
-    The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
-    a stopping test is the sum of an absolute and a relative term, `tol` is the relative
-    tolerance and the absolute tolerance is negligible. A backend without an entry in
-    `CALLS` runs with its own defaults. The objective is scaled to ‖q‖∞ = 1e4, or to
-    ‖q‖∞ = 1 if the backend's test is absolute (highs, daqp). Backends that accept both
-    dense and sparse matrices receive dense matrices if P is dense.
+    The tolerance is passed in the backend's own keywords (`solvers.common.backends`).
+    If the threshold of a stopping test is the sum of an absolute and a relative term,
+    `tol` is the relative tolerance and the absolute tolerance is negligible. A backend
+    that is not listed there runs with its own defaults. The objective is scaled to ‖q‖∞
+    = 1e4, or to ‖q‖∞ = 1 if the backend's test is absolute (highs, daqp). Backends that
+    accept both dense and sparse matrices receive dense matrices if P is dense.
     """
 
     about: ClassVar[About] = About(
@@ -166,8 +125,10 @@ class QPSolvers(BackendAdapter):
     def _prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import qpsolvers
 
-        call = CALLS.get(self.backend, Call())
+        call = call_of(self.backend)
         options = self.tuned(**call.options(tol))
+        if self.backend == "osqp":
+            options.setdefault("raise_error", False)
         scale = objective_factor(qp, call.size)
         takes_dense = self.backend in qpsolvers.dense_solvers
         as_dense = takes_dense and isinstance(qp.P, np.ndarray)

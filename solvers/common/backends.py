@@ -18,7 +18,7 @@ from typing import Any
 
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.common.adapter import Adapter
-from mortarbench.solvers.common.conversion import OBJECTIVE_SIZE
+from mortarbench.solvers.common.conversion import NEGLIGIBLE, OBJECTIVE_SIZE
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,53 @@ class Call:
         """Return all keyword arguments of the backend for the tolerance `tol`."""
         value = max(self.tighter * tol, self.floor)
         return {**dict.fromkeys(self.tolerances, value), **self.fixed}
+
+
+#: arguments for each backend, in lower case; others run with their defaults
+CALLS: Mapping[str, Call] = {
+    "clarabel": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
+    "cvxopt": Call(("feastol", "abstol", "reltol")),
+    "daqp": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
+    "highs": Call(
+        ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
+        # by default HiGHS adds 1e-7 to the Hessian and drops entries below 1e-9
+        {
+            "qp_regularization_value": 0.0,
+            "small_matrix_value": 1e-12,
+            "threads": 1,
+            "qp_iteration_limit": 1_000_000,  # without a limit, HiGHS may cycle
+        },
+        size=1.0,
+        tighter=1e-2,
+        floor=1e-10,
+    ),
+    "osqp": Call(
+        ("eps_rel",),
+        {"eps_abs": NEGLIGIBLE, "max_iter": 1_000_000, "polishing": False},
+    ),
+    "piqp": Call(
+        ("eps_rel", "eps_duality_gap_rel"),
+        {"eps_abs": NEGLIGIBLE, "eps_duality_gap_abs": NEGLIGIBLE},
+    ),
+    "proxqp": Call(
+        ("eps_rel", "eps_duality_gap_rel"),
+        {
+            "eps_abs": NEGLIGIBLE,
+            "eps_duality_gap_abs": NEGLIGIBLE,
+            "check_duality_gap": True,
+        },
+    ),
+    "qoco": Call(("reltol", "reltol_inacc"), {"abstol": NEGLIGIBLE}),
+    "qpalm": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
+    "qtqp": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel")),
+    "scs": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
+    "sip": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
+}
+
+
+def call_of(backend: str) -> Call:
+    """Return the arguments for a backend of qpsolvers or cvxpy."""
+    return CALLS.get(backend.lower(), Call())
 
 
 @dataclass(frozen=True)
