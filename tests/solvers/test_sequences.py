@@ -14,8 +14,6 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 
 pytestmark = pytest.mark.together
 
-WARM = ["smalbe"]
-
 
 @pytest.fixture(scope="module")
 def load_steps():
@@ -30,10 +28,9 @@ def load_steps():
     return {form: build(form) for form in ("primal", "dual", "dual-bounds")}
 
 
-@pytest.mark.parametrize("name", WARM)
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
-def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form, name):
-    solver, tol = SOLVERS[name], 1e-8
+def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form):
+    solver, tol = SMALBE(), 1e-8
     prepare = solver.chain(tol)
     warm = [prepare(qp)() for qp in load_steps[form]]
     cold = [solver.prepare(qp, tol)() for qp in load_steps[form]]
@@ -47,15 +44,14 @@ def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form, name):
     assert products(warm) < 0.9 * products(cold)
 
 
-@pytest.mark.parametrize("name", WARM)
-def test_steps_without_common_data_are_solved(load_steps, manufactured, name):
+def test_steps_without_common_data_are_solved(load_steps, manufactured):
     """The QPs differ in size, scale and sign, and one of them is infeasible."""
     qp, other = load_steps["dual"][9], load_steps["dual"][0]
     box, _ = manufactured("box", seed=271828)
     impossible = replace(qp, A=np.vstack([qp.A, qp.A[:1]]), b=np.append(qp.b, 1e3))
     sequence = [qp, box, qp, replace(qp, P=1e6 * qp.P, q=1e6 * qp.q), other, impossible]
     sequence += [replace(qp, P=1e-6 * qp.P), replace(qp, q=-qp.q), qp]
-    prepare = SOLVERS[name].chain(1e-6)
+    prepare = SMALBE().chain(1e-6)
     found = [prepare(qp)() for qp in sequence]
 
     for qp, s in zip(sequence, found, strict=True):
@@ -88,12 +84,11 @@ class Counting:
         return self.P @ v
 
 
-@pytest.mark.parametrize("name", WARM)
-def test_every_product_of_a_sequence_is_counted(load_steps, name):
+def test_every_product_of_a_sequence_is_counted(load_steps):
     """The products of a spectrum that turns out to be outdated are included."""
     qps = load_steps["dual"]
     steps = [*qps[:3], replace(qps[3], P=1e3 * qps[3].P), qps[4], *qps[4:6]]
-    prepare = SOLVERS[name].chain(1e-6)
+    prepare = SMALBE().chain(1e-6)
     for qp in steps:
         calls = []
         s = prepare(replace(qp, P=Counting(qp.P, calls)))()
@@ -115,11 +110,8 @@ def test_warm_multipliers_and_ritz_pairs_save_products(load_steps):
     assert sum(warm[1:]) <= 0.8 * sum(cold[1:])
 
 
-@pytest.mark.parametrize("name", WARM)
 @pytest.mark.parametrize("jump", [1e2, pytest.param(1e4, marks=pytest.mark.slow)])
-def test_a_spectrum_orthogonal_to_the_last_solution_is_detected(
-    manufactured, name, jump
-):
+def test_a_spectrum_orthogonal_to_the_last_solution_is_detected(manufactured, jump):
     """P = I is followed by a far larger P that agrees with I on the first component."""
     rng = np.random.default_rng(271828)
     qp, _ = manufactured("bounds", seed=271828, dense=True)
@@ -127,7 +119,7 @@ def test_a_spectrum_orthogonal_to_the_last_solution_is_detected(
     W[:, 0] = 0
     first = replace(qp, P=np.eye(20), q=-np.eye(20)[0], lb=np.zeros(20))
     then = replace(first, P=np.eye(20) + jump * W.T @ W / 20)
-    solver = SOLVERS[name]
+    solver = SMALBE()
     prepare = solver.chain(1e-8)
     prepare(first)()
     s = prepare(then)()
