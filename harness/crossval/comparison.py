@@ -185,7 +185,7 @@ def _elastic_reference(mechanics: Mechanics, solve: Reference) -> _Reference:
     If ‖u*‖ = 0, errors are relative to the energy norm of the displacement under the
     load without contact.
     """
-    point, exact = reference_point(mechanics, solve), mechanics.exact
+    (point, _), exact = reference_point(mechanics, solve), mechanics.exact
 
     def deviations(g: StoredAnswer) -> tuple[Extended, Extended]:
         assert g.case.mechanics is not None

@@ -9,11 +9,9 @@ extended precision, and `harness.verify.certificate` bounds the error of this so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from mortarbench.harness.mechanics import Extended, Mechanics, Real
+from mortarbench.harness.mechanics import Mechanics, Real
 from mortarbench.harness.plugin import Reference
 from mortarbench.harness.qp import QP, no_rows
 from mortarbench.harness.verify.active_set_refinement import (
@@ -24,7 +22,11 @@ from mortarbench.harness.verify.active_set_refinement import (
     unconstrained_guess,
 )
 from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
-from mortarbench.harness.verify.certificate import UncertifiableError, proof
+from mortarbench.harness.verify.certificate import (
+    Certificate,
+    UncertifiableError,
+    proof,
+)
 from mortarbench.harness.verify.substructured import Split
 
 
@@ -32,20 +34,12 @@ class UnsolvedError(Exception):
     """Failure of the reference solve; the message is the reason."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ReferencePoint:
-    """A solution of the elastic problem, and a certified bound on its error."""
+def reference_point(
+    mechanics: Mechanics, solve: Reference
+) -> tuple[Certificate, States]:
+    """Solve the elastic problem of a case; return a certified solution and its states.
 
-    u: Extended  #: (n,) admissible displacement
-    multipliers: Extended  #: (m,) multipliers of contact, then of friction rows
-    equilibrium: Extended  #: u_λ (n,), in equilibrium with the multipliers
-    states: States  #: (m,) states of the rows: closed, or multiplier at a bound
-    norm: float  #: ‖u‖_K
-    bound: float  #: certified bound on the relative error; see `Certificate.bound`
-
-
-def reference_point(mechanics: Mechanics, solve: Reference) -> ReferencePoint:
-    """Solve the elastic problem of a case, and certify the solution.
+    The states (m,) of the rows are closed, or that the multiplier is at a bound.
 
     solve : solves the dual QP, min ½λᵀFλ − dᵀλ subject to RᵀBᵀλ = Rᵀf, λ ≥ 0 for
         contact and ‖λ‖ ≤ g for friction
@@ -59,19 +53,12 @@ def reference_point(mechanics: Mechanics, solve: Reference) -> ReferencePoint:
     mechanics = mechanics.whole
     u, lam, active = exchanged(mechanics, _identified(mechanics, solve))
     try:
-        certificate = proof(Split(mechanics), u, u, lam, active.closed)
+        found = proof(Split(mechanics), u, u, lam, active.closed)
     except UncertifiableError as e:
         raise UnsolvedError(
             f"the reference solve found no admissible pair: {e}"
         ) from None
-    return ReferencePoint(
-        u=certificate.u,
-        multipliers=certificate.multipliers,
-        equilibrium=certificate.equilibrium,
-        states=active.states,
-        norm=certificate.norm,
-        bound=certificate.bound,
-    )
+    return found, active.states
 
 
 def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:

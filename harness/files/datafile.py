@@ -29,7 +29,6 @@ VARIABLE = "MORTARBENCH_MOST_MIB"
 DEFAULT_MIB = 2048
 MIB = 2**20  #: number of bytes in a mebibyte
 
-_PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 _PARSER_BYTES = 256 * MIB  #: memory that a parser may use in addition to the data
 
 
@@ -61,11 +60,10 @@ def check_size(what: str, size: int) -> None:
 
 
 @contextmanager
-def opened(path: Path, expected: str, *, limited: bool = True) -> Iterator[BinaryIO]:
+def opened(path: Path, expected: str) -> Iterator[BinaryIO]:
     """Open a regular file for reading; pipes and devices are refused.
 
     expected : description of the file, for messages, e.g. "an npz file"
-    limited : refuse a file larger than the memory limit
 
     Raises
     ------
@@ -74,8 +72,7 @@ def opened(path: Path, expected: str, *, limited: bool = True) -> Iterator[Binar
 
     """
     with reading.opened(path, expected) as file:
-        if limited:
-            check_size(f"{path}: the file", os.fstat(file.fileno()).st_size)
+        check_size(f"{path}: the file", os.fstat(file.fileno()).st_size)
         yield file
 
 
@@ -98,26 +95,22 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             size = os.fstat(file.fileno()).st_size
             check_size(f"{path}: its content", copies * size)
             return file.read(size)
+        most = max_bytes() // copies
         try:
-            most, size = max_bytes() // copies, 0
-            with gzip.GzipFile(fileobj=file) as pieces:
-                while piece := pieces.read(
-                    _PIECE_BYTES
-                ):  # the first pass counts the bytes without storing them
-                    if (size := size + len(piece)) > most:
-                        raise InputError(
-                            f"{path}: its expanded content would take more than "
-                            f"{max_bytes() // MIB} MiB of memory with its parser; "
-                            f"expected less (set {VARIABLE} to allow more)"
-                        )
-            file.seek(0)
             with gzip.GzipFile(fileobj=file) as whole:
-                return whole.read(size)
+                data = whole.read(most + 1)
         # the content is not gzip data, is truncated, or is damaged
         except (OSError, EOFError, zlib.error):
             raise InputError(
                 f"{path}: not a gzip file, or damaged; expected {expected}, compressed"
             ) from None
+    if len(data) > most:
+        raise InputError(
+            f"{path}: its expanded content would take more than {max_bytes() // MIB} "
+            f"MiB of memory with its parser; expected less (set {VARIABLE} to allow "
+            "more)"
+        )
+    return data
 
 
 def content_digest(*paths: Path) -> str:

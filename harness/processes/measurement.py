@@ -23,11 +23,10 @@ from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import REMEMBERED_SPEEDUP
 from mortarbench.harness.verify.verdicts import (
-    certified,
     claimed,
     judged,
     noted,
-    quantities_of,
+    results_of,
 )
 
 REMEMBERED_NOTE = (
@@ -220,10 +219,5 @@ def measure_once(
     declined = record.status is Verdict.DECLINED
     if solution is None or declined or not needs_evaluation:
         return record, solution
-    if not record.quantities:
-        quantities, note = quantities_of(case(), solution)
-        record = noted(record, note).replace(quantities=quantities)
-    if record.certify_seconds is None:
-        bounds, objection = certified(case(), solution)
-        record = noted(record, objection).replace(**bounds)
-    return record, solution
+    results, notes = results_of(case(), solution)
+    return noted(record.replace(**results), *notes), solution

@@ -59,6 +59,7 @@ class Executor:
     _loaded: dict[str, QP] = field(default_factory=dict)  # QPs of `_entries`, by digest
 
     def __post_init__(self) -> None:
+        self._point = self.scratch / "point.npz"
         self._case_worker = WorkerProcess(
             self.commands.case_worker, self.scratch / "case-worker.log"
         )
@@ -287,10 +288,6 @@ class Executor:
         if entry.digest not in self._loaded:
             self._loaded[entry.digest] = load_qp(entry.qp, operators=self.operators)[0]
         return self._loaded[entry.digest]
-
-    @property
-    def _point(self) -> Path:
-        return self.scratch / "point.npz"
 
 
 def execute(

@@ -136,11 +136,17 @@ def evaluated(case: Case, s: Solution, tol: float) -> tuple[dict[str, Any], list
     fields, *notes = judgement(case.qp, s, tol)
     if s.status is Status.DECLINED:
         return fields, notes
+    results, further = results_of(case, s)
+    return fields | results, notes + further
+
+
+def results_of(case: Case, s: Solution) -> tuple[dict[str, Any], list[str]]:
+    """Return quantities and error bounds as fields of a record, and notes."""
     start = perf_counter()
     quantities, note = quantities_of(case, s)
-    fields |= {"quantities": quantities, "recover_seconds": perf_counter() - start}
+    fields = {"quantities": quantities, "recover_seconds": perf_counter() - start}
     bounds, objection = certified(case, s)
-    return fields | bounds, [*notes, note, objection]
+    return fields | bounds, [note, objection]
 
 
 def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:

@@ -159,8 +159,8 @@ def exact_solution(mechanics: Mechanics) -> ExactSolution:
 
     """
     mechanics = mechanics.whole
-    near = reference_point(mechanics, reference_solution)
-    states, pinned = near.states, near.u
+    near, states = reference_point(mechanics, reference_solution)
+    pinned = near.u
     for _ in range(12):
         u, lam = _given(mechanics, states, pinned)
         wrong = _exchanged(mechanics, states, u, lam)

@@ -15,10 +15,10 @@ from numpy.testing import assert_allclose
 from scipy.sparse import block_diag
 
 from mortarbench.harness import Mechanics, UncertifiableError, certify
-from mortarbench.harness.crossval.references import ReferencePoint, reference_point
+from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.mechanics import DecomposedMechanics, Real
 from mortarbench.harness.names import parse
-from mortarbench.harness.verify.certificate import certify_pair
+from mortarbench.harness.verify.certificate import Certificate, certify_pair
 from mortarbench.harness.verify.substructured import Subdomains, neighbour
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.feti.substructures import LocalProblems
@@ -34,12 +34,12 @@ PATCH = "contact-patch/ratio=0.1/feti=2"
 
 
 @cache
-def known(name: str) -> tuple[Mechanics, DecomposedMechanics, ReferencePoint]:
+def known(name: str) -> tuple[Mechanics, DecomposedMechanics, Certificate]:
     """Return a problem, its subdomains, and its solution up to rounding."""
     case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
     whole = case.mechanics.whole
-    exact = reference_point(whole, reference_solution)
+    exact, _ = reference_point(whole, reference_solution)
     return whole, mechanics_of(parts_of(f"{name}/dual")), exact
 
 
@@ -52,7 +52,7 @@ def excess_of_rounding(name: str, tols: tuple[float, ...]) -> list[float]:
     case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
     whole, ratios = case.mechanics.whole, list[float]()
-    exact = reference_point(whole, reference_solution)
+    exact, _ = reference_point(whole, reference_solution)
     for tol in tols:
         s = case.mechanics.to_primal(SMALBE().prepare(case.qp, tol)())
         found = certify(case.mechanics, s)
