@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from hashlib import sha256
-from typing import IO, TYPE_CHECKING, TypeAlias
-
-if TYPE_CHECKING:
-    from hashlib import _Hash
-
-Digest: TypeAlias = "_Hash"  #: SHA-256 hash object, to which ``update`` appends bytes
+from typing import IO
 
 _PIECE_BYTES = 2**20  #: number of bytes that are read in one call
 
@@ -23,15 +18,10 @@ def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
     >>> hex_digest([b"a", b"b"]) == hex_digest([b"ab"])
     True
     """
-    return running_digest(parts).hexdigest()[:digits]
-
-
-def running_digest(parts: Iterable[bytes]) -> Digest:
-    """Return a SHA-256 hash object, to which all `parts` have been appended."""
     content = sha256()
     for part in parts:
         content.update(part)
-    return content
+    return content.hexdigest()[:digits]
 
 
 def pieces(file: IO[bytes]) -> Iterator[bytes]:

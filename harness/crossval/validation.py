@@ -67,7 +67,7 @@ def validate_folder(
     """
     build = partial(rebuild, folder=path, families=families, reference=reference)
     answers: list[Answer] = []
-    groups, begun = _groups(map(_apart, read_journal(path))), monotonic()
+    groups, begun = _groups(read_journal(path)), monotonic()
     for number, (name, group) in enumerate(groups.items(), 1):
         if answers and monotonic() - begun > budget:
             late = f"not begun within the budget of {budget:g} s"
@@ -82,9 +82,14 @@ def validate_folder(
 
 
 def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Group records by physical case, sorted by name; omit declined QPs."""
+    """Group records by physical case, sorted by name; omit declined QPs.
+
+    For a step of a sequence, the label of the solver includes the mode.
+    """
     groups: dict[str, list[Record]] = {}
     for r in sorted(records, key=lambda r: (r.case, -r.tol, r.solver, r.repeat)):
+        if r.mode != "cold":
+            r = r.replace(solver=f"{r.solver} ({r.mode})")
         if r.status is not Verdict.DECLINED:
             groups.setdefault(r.case.removesuffix(f"/{r.form}"), []).append(r)
     return groups
@@ -193,8 +198,3 @@ def _stored_answer(path: Path, r: Record, case: Case) -> StoredAnswer:
     return StoredAnswer(
         record=r, case=case, solution=s, remark=_CHANGED if changed else ""
     )
-
-
-def _apart(r: Record) -> Record:
-    """Return the record; for a step of a sequence, the label includes the mode."""
-    return r if r.mode == "cold" else r.replace(solver=f"{r.solver} ({r.mode})")

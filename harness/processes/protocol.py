@@ -97,11 +97,6 @@ def event_of(line: bytes, expected: str) -> dict[str, Any]:
     )
 
 
-def measures(request: Mapping[str, Any]) -> bool:
-    """Return True if a request is a measurement; other requests are not timed."""
-    return "out" in request
-
-
 class Source(StrEnum):
     """Origin of the QP of a measurement, which determines who judges the answer."""
 

@@ -43,7 +43,6 @@ from mortarbench.harness.processes.protocol import (
     MAX_REPLY_BYTES,
     ForeignReplyError,
     event_of,
-    measures,
     source_of,
 )
 from mortarbench.harness.record import Verdict
@@ -229,7 +228,7 @@ class WorkerProcess:
             self._log.write_bytes(b"")
         oom_kills, sent, elapsed = _oom_kills(), time.monotonic(), None
         self._send(request)
-        is_shared, is_timed = source_of(request).is_shared, measures(request)
+        is_shared, is_timed = source_of(request).is_shared, "out" in request
         final_limit = time_limit
         try:
             if is_shared:
