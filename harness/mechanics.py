@@ -703,11 +703,6 @@ class Mechanics:
         objective = objective + self.exact.friction_work(u).sum()
         return float(self.scale * objective + self.constant)
 
-    @property
-    def kernel(self) -> Any:
-        """Rigid motions (n, r) that the supports allow, in extended precision."""
-        return self.motions.all
-
     @cached_property
     def motions(self) -> RigidMotions:
         """Rigid motions that the supports allow, as constrained and free motions."""
@@ -718,14 +713,10 @@ class Mechanics:
         """The stiffness K (n, n)."""
         return csr_array(self.primal.P)
 
-    def without_rigid_motion(self, v: Extended) -> Extended:
-        """Return v − RRᵀv (n,), where R is `kernel`."""
-        return self.motions.without(v)
-
     def apply_inverse(self, force: Extended) -> Extended:
-        """Apply PK⁺P to a force (n,), where P = I − RRᵀ and R is `kernel`."""
-        u = self.inverse(self.without_rigid_motion(force).astype(np.float64))
-        return self.without_rigid_motion(u.astype(Real))
+        """Apply PK⁺P to a force (n,), where P = I − RRᵀ and R is `motions.all`."""
+        u = self.inverse(self.motions.without(force).astype(np.float64))
+        return self.motions.without(u.astype(Real))
 
     def norm(self, v: Extended) -> float:
         """Return the energy norm ‖v‖_K, which is a seminorm if bodies can move rigidly.
@@ -734,7 +725,7 @@ class Mechanics:
         errors, which would dominate if the rigid part were much larger than the
         deformation.
         """
-        v = self.without_rigid_motion(v)
+        v = self.motions.without(v)
         return float(np.sqrt(max(v @ (self.stiffness @ v), Real(0))))
 
 

@@ -72,7 +72,7 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
     for _ in range(3):
         r = force - K @ u
         r[fixed] = 0
-        r = mechanics.without_rigid_motion(r)
+        r = mechanics.motions.without(r)
         step = mechanics.apply_inverse(r)
         left = float(np.sqrt(abs(r @ step)))
         u = u + step

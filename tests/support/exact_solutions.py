@@ -99,7 +99,7 @@ class ExactSolution:
     @cached_property
     def _R(self) -> tuple[Integers, list[list[Fraction]]]:
         """Rigid motions (n, r), and the inverse of RᵀR."""
-        R = integers(np.asarray(self.mechanics.kernel.toarray()))
+        R = integers(np.asarray(self.mechanics.motions.all.toarray()))
         gram = [[Fraction(sum(a * b)) for b in R.T] for a in R.T]
         return R, _inverse(gram)
 
@@ -180,7 +180,7 @@ def _given(
     free, closed = np.setdiff1d(np.arange(len(K)), exact.fixed), states == CLOSED
     lam = np.where(states == LOWER, lower, np.where(states == UPPER, upper, 0))
     rows = B[closed][:, free]
-    kernel = mechanics.kernel.toarray().astype(np.float64)[free]
+    kernel = mechanics.motions.all.toarray().astype(np.float64)[free]
     loose = _loose(rows, kernel)
     rows = np.vstack([rows, loose.T])
     A = np.block(

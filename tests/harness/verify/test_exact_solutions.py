@@ -338,7 +338,7 @@ def test_admissible_points_do_not_penetrate_in_exact_arithmetic(name):
 
 def test_a_displacement_is_measured_without_its_rigid_motion():
     _, exact = known(SMALL)
-    rigid = exact.mechanics.kernel.toarray()[:, 0].astype(float)
+    rigid = exact.mechanics.motions.all.toarray()[:, 0].astype(float)
     v = np.zeros(rigid.size)
     v[-3:] = 1, 2, 3
 
