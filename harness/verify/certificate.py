@@ -89,6 +89,7 @@ from mortarbench.harness.verify.admissible import (
 )
 from mortarbench.harness.verify.kkt import largest_eigenvalue
 from mortarbench.harness.verify.substructured import (
+    Neighbour,
     Rounding,
     Split,
     Subdomains,
@@ -406,6 +407,19 @@ def proof(
     return _evaluated(split, claimed, feasible, lam)
 
 
+def _equilibrium(
+    split: Split, u: Extended, lam: Extended
+) -> tuple[Neighbour, float, float, float]:
+    """Return u_λ as a neighbour of û, with vᵀK_T v, vᵀK_T d and θ for v = T(û − RRᵀû).
+
+    The residual and v are not kept, because they may be large.
+    """
+    rho, v, square, theta = split.residual(u)
+    rho += split.pulled(lam)
+    near = neighbour(split, rho)
+    return near, square, float(v @ near.Kd), theta
+
+
 def _evaluated(
     split: Split, claimed: Vector | Extended, u: Extended, lam: Extended
 ) -> Certificate:
@@ -414,12 +428,10 @@ def _evaluated(
     motion = exact.motion(u)
     pressing, sliding = (w.sum() for w in exact.missing_work(lam, motion))
     work = float(pressing + sliding)
-    at_u = split.residual(u)
-    near = neighbour(split, at_u.rho + split.pulled(lam))
+    near, u_u, u_d, theta = _equilibrium(split, u, lam)
     drift = motions.without(claimed - u)
     moved = split.spread(drift)
     moved_moved = float(moved @ split.product(moved))
-    u_u, u_d = at_u.square, float(at_u.v @ near.Kd)
     d_d, moved_d = (float(v @ near.Kd) for v in (near.d, moved))
     weights = relative(exact.forces.interior(lam))
     supported, _ = supported_and_floating(motions.G, weights)
@@ -429,10 +441,11 @@ def _evaluated(
         """Return the magnitudes (h,) of Rα along the supported motions."""
         return np.asarray(np.abs(supported.T @ alpha[:p]), dtype=np.float64)
 
-    theta, off = at_u.theta, None
+    off = None
     # If û is small, its θ may differ from the θ of the error. For û = 0, θ is 0.
     if u_u < 4 * d_d:
-        theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
+        v = split.spread(motions.without(u))
+        theta = max(theta, split.residual(split.averaged(v - near.d)).theta)
         off = split.excess(drift)
     computed, left = _root(d_d), near.left + length(split, noise)
     total, nearest = computed + left, max(computed - left, 0.0)

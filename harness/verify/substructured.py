@@ -237,7 +237,7 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
     `size` is the norm of the last correction. If `MAX_REFINEMENTS` corrections do not
     suffice, all of them are added, and the same bound holds.
     """
-    d = Kd = split.spread(0 * rho)
+    d, Kd = split.spread(0 * rho), split.spread(0 * rho)
     rest, before = rho, np.inf
     for _ in range(MAX_REFINEMENTS):
         unbalanced = split.motions.along(rest)
@@ -248,7 +248,10 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
         q = size / before if before else 0.0
         if before < np.inf and size <= REFINEMENT_TOLERANCE * np.sqrt(max(whole, 0.0)):
             break
-        d, Kd, before = d + step, Kd + pull, size
+        d += step  # in place, since vectors may be large
+        Kd += pull
+        del step, pull
+        before = size
         rest = rho - split.joined(Kd)
     return Neighbour(d, Kd, size / (1 - q) if q < 1 else np.inf, unbalanced)
 
@@ -296,9 +299,8 @@ class Subdomains(Split):
         parts, fixed = bodies.parts, self.exact.fixed
         T, w = csr_array(parts.spread), parts.weight
         self._parts, self._T = parts, T
-        squares = csr_array((T.data**2, T.indices, T.indptr), shape=T.shape)
+        squares = self._squares
         total = squares.T @ w
-        self._squares = squares
         #: (N,) weights D of the copies of a component, a partition of unity: TᵀDT = I
         self._part = w / (squares @ total)
         jointly = squares.T @ np.ones(w.size) > 1 + 1e-9
@@ -310,6 +312,12 @@ class Subdomains(Split):
         WT = csr_array(W @ T[rows])
         self._rows, self._R = rows, csr_array(parts.kernel[rows])
         self._Z = csr_array(W - WT @ (diags_array(inverse) @ WT.T))
+
+    @property
+    def _squares(self) -> csr_array:
+        """Squares of the entries of T, (N, n); not stored, because T is large."""
+        T = self._T
+        return csr_array((T.data**2, T.indices, T.indptr), shape=T.shape)
 
     @cached_property
     def _coarse(self) -> Callable[[Vector], Vector]:

@@ -195,9 +195,12 @@ def case_on_ranks(
         acts = np.append(np.ones(linearised.rows.c.size), bound) > 0
 
         def results(s: Solution) -> Mapping[str, Any]:
-            state = interface_state(dual, linearised, displacement(s), s)
+            u, parts = displacement(s), served.local_problems
+            state, v = interface_state(dual, linearised, u, s), parts.spread @ u
+            energy = float(v @ parts.product(v) / 2 - v @ torn.f)
+            largest = served.lead("largest_stresses", u)
             return {
-                **quantities(*state, *served.lead("bulk", displacement(s))),
+                **quantities(*state, energy, largest),
                 **problem.results(ContactSolution(state, count)),
                 **decomposition_quantities(served, dual.qp),
             }
@@ -228,7 +231,7 @@ def interface_state(
     primal = _interface_qp(at.bodies, at.fixed, at.rows)
     if at.friction.bound.size:
         diagonal, components = np.zeros(u.size), np.unique(at.friction.T.indices)
-        diagonal[components] = dual.parts.diagonal(components)
+        diagonal[components] = dual.served.local_problems.diagonal(components)
         primal = replace(primal, P=csc_array(diags_array(diagonal)))
     y, z = np.zeros(primal.b.size), dual.multipliers(s)
     whole = Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=np.zeros(u.size))
@@ -283,7 +286,8 @@ def decompose(
         piece=pieces,
         shaping=None if layout.shaping is None else layout.shaping(share),
         fixed=stage.fixed,
-        load=stage.load * stage.part,
+        # an array that several stages share takes memory only once
+        load=stage.load if stage.part == 1 else stage.load * stage.part,
         lift=lift,
         glue=glue,
         contact=_without_supports(

@@ -21,7 +21,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Friction, Solution, Vector
 from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.mechanics import NO_FRICTION, Substructures, contact_rows
+from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.problems.duality.dualisation import Transformed, multiplier_sets
 from mortarbench.problems.feti.operators import block_bytes, touched_components
@@ -29,7 +29,6 @@ from mortarbench.problems.feti.served import (
     OperatorOnRanks,
     Served,
     operator_of,
-    parts_of,
 )
 from mortarbench.problems.feti.subdomains import TornBodies
 
@@ -55,11 +54,6 @@ class TornDual:
         """Rigid motions (N, r) of all subdomains."""
         kernel: csr_array = self.served.lead("domains.kernel")
         return kernel
-
-    @cached_property
-    def parts(self) -> Substructures:
-        """The local problems for certificates."""
-        return parts_of(self.served)
 
     @property
     def sets(self) -> tuple[ConvexSet, ...]:

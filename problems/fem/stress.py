@@ -28,8 +28,8 @@ from mortarbench.problems.fem.elasticity import (
 )
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
 
-#: number of cells that are evaluated at a time to limit the memory
-STRIP_CELLS = 2**14
+#: numbers of cells and of nodes that are evaluated at a time to limit the memory
+STRIP_CELLS = STRIP_NODES = 2**14
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
@@ -77,6 +77,8 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     corner = np.ones(mesh.cells.shape, dtype=bool)
     corner[:, 1:] = mesh.cells[:, 1:] != mesh.cells[:, :-1]
     N, dim = mesh.points.shape
+    interior = np.ones(N, dtype=bool)
+    interior[boundary_facets(mesh.cells, dim)] = False
     k, terms = values.shape[1], dim + 1
     size = np.ptp(mesh.points, axis=0).max()
     centre = np.average(
@@ -96,10 +98,10 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         for p, q in np.ndindex(terms, k):
             right[:, p, q] += np.bincount(nodes, basis[:, p] * values[cells, q], N)
 
-    interior = np.ones(N, dtype=bool)
-    interior[boundary_facets(mesh.cells, dim)] = False
     polynomial = np.zeros((N, terms, k))
-    polynomial[interior] = np.linalg.solve(normal[interior], right[interior])
+    for first in range(0, N, STRIP_NODES):
+        strip = first + np.flatnonzero(interior[first : first + STRIP_NODES])
+        polynomial[strip] = np.linalg.solve(normal[strip], right[strip])
     has_value = interior
     for _ in range(2):  # average over interior nodes, then over boundary nodes
         b, i = _neighbours(mesh, ~has_value, has_value)

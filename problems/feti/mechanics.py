@@ -18,7 +18,7 @@ from mortarbench.harness.mechanics import (
 )
 from mortarbench.problems.fem.elasticity import rigid_modes
 from mortarbench.problems.fem.mesh import dofs_of
-from mortarbench.problems.feti.served import Served, parts_of
+from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdomains import DecomposedProblem
 
 
@@ -32,7 +32,7 @@ def torn_mechanics(
 
     @cache
     def bodies() -> DecomposedMechanics:
-        problem, parts = served.torn.problem, parts_of(served)
+        problem, parts = served.torn.problem, served.local_problems
         contact, bound = problem.contact, problem.contact.bound
         n, m = problem.components * problem.layout.nodes, contact.c.size
         acts = np.append(np.ones(m - bound.size), bound) > 0

@@ -62,20 +62,33 @@ class Served:
         """The local problems for certificates; supports are rows of B."""
         return LocalProblems(self.torn)
 
+    @cached_property
+    def local_problems(self) -> Substructures:
+        """The local problems on rank 0; on several ranks, methods call all ranks."""
+        if self.torn.comm.size == 1:
+            return self.parts
+        methods = ("diagonal", "product", "squared_product", "solve")
+        on_ranks: Any = SimpleNamespace(
+            spread=self.parts.spread,
+            kernel=self.lead("parts.torn.domains.kernel"),
+            weight=self.lead("weights"),
+            **{name: partial(self.lead, f"parts.{name}") for name in methods},
+        )
+        return cast(Substructures, on_ranks)
+
     def weights(self) -> Vector:
         """Return the weights of the local problems, (N,)."""
         return self.parts.weight
 
-    def bulk(self, u: Vector) -> tuple[float, Vector]:
-        """Return ½uᵀKu − fᵀu and the largest stress (bodies,) of each body, Pa.
+    def largest_stresses(self, u: Vector) -> Vector:
+        """Return the largest stress of each body, (bodies,), Pa.
 
         u : (n,) nondimensional displacement
         """
         assert self.stresses is not None
-        v, comm = self.parts.spread @ u, self.torn.comm
-        energy = float(v @ self.parts.product(v) / 2 - v @ self.parts.torn.f)
+        comm = self.torn.comm
         largest = comm.gather(comm.together(partial(self.stresses, u)))
-        return energy, np.max(largest, axis=0) if largest else np.zeros(0)
+        return np.max(largest, axis=0) if largest else np.zeros(0)
 
     def forget(self) -> None:
         """Discard the factors of the dual operator."""
@@ -101,20 +114,6 @@ def operator_of(served: Served) -> SerialisableOperator | OperatorOnRanks:
     if served.torn.comm.size == 1:
         return dual_operator(served.operator)
     return OperatorOnRanks(served)
-
-
-def parts_of(served: Served) -> Substructures:
-    """Return the local problems on rank 0; on several ranks, methods call all ranks."""
-    if served.torn.comm.size == 1:
-        return served.parts
-    methods = ("diagonal", "product", "squared_product", "solve")
-    on_ranks: Any = SimpleNamespace(
-        spread=served.parts.spread,
-        kernel=served.lead("parts.torn.domains.kernel"),
-        weight=served.lead("weights"),
-        **{name: partial(served.lead, f"parts.{name}") for name in methods},
-    )
-    return cast(Substructures, on_ranks)
 
 
 class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no types

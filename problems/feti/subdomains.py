@@ -151,23 +151,27 @@ class TornBodies:
         """Torn nodes of all subdomains, (M,)."""
         return self.problem.layout.torn
 
-    @cached_property
+    @property
     def component(self) -> Nodes:
-        """Component of each torn unknown."""
+        """Component of each torn unknown, (N,)."""
         d = self.problem.components
         return np.asarray((d * self.nodes.number[:, None] + np.arange(d)).ravel())
 
     @cached_property
     def spread(self) -> csr_array:
-        """T (N, n), which maps displacements to torn unknowns in subdomain axes.
+        """T (N, n), which maps displacements to torn unknowns in subdomain axes."""
+        return self.spread_to(slice(None))
+
+    def spread_to(self, nodes: Nodes | slice) -> csr_array:
+        """Return the rows (d·k, n) of T at k torn nodes.
 
         Each torn node has a block Qᵀ, the transpose of the rotation of its subdomain.
         """
-        d, place = self.problem.components, self.nodes.number
+        d, place = self.problem.components, self.nodes.number[nodes]
         M, n = place.size, d * self.problem.layout.nodes
         if d == 1:
             return csr_array((np.ones(M), place, np.arange(M + 1)), shape=(M, n))
-        turn = self.rotation[self.nodes.subdomain].transpose(0, 2, 1)
+        turn = self.rotation[self.nodes.subdomain[nodes]].transpose(0, 2, 1)
         blocks = np.ascontiguousarray(turn), place, np.arange(M + 1)
         T = csr_array(bsr_array(blocks, shape=(d * M, n)))
         T.eliminate_zeros()
@@ -260,8 +264,7 @@ class TornBodies:
         assembly is expensive.
         """
         copy = replace(self, problem=problem)
-        same = ("_classified", "component")
-        vars(copy).update({k: v for k, v in vars(self).items() if k in same})
+        vars(copy).update({"_classified": self._classified})
         return copy
 
 

@@ -40,7 +40,7 @@ class LocalProblems:
         """R (N, r), a basis of the rigid motions of all subdomains."""
         return self.torn.domains.kernel()
 
-    @cached_property
+    @property
     def weight(self) -> Vector:
         """Sum of the diagonal entries of K at the node of each torn unknown, (N,)."""
         d, domains = self.torn.problem.components, self.torn.domains
@@ -53,18 +53,18 @@ class LocalProblems:
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
         """Return the diagonal entries of TᵀKT for the columns `at` (k,) of T."""
         d, domains = self.torn.problem.components, self.torn.domains
-        nodes = np.unique(csr_array(self.spread[:, at]).nonzero()[0] // d)
-        number = np.full(self.spread.shape[0] // d, -1)
+        is_near = np.isin(self.torn.nodes.number, np.unique(at // d))
+        nodes = np.flatnonzero(is_near)
+        number = np.full(is_near.size, -1)
         number[nodes] = np.arange(nodes.size)
         blocks = np.zeros((nodes.size, d, d))
         for template, place in domains.places():
             places = number[place[::d] // d]
             node, subdomain = np.nonzero(places >= 0)
             blocks[places[node, subdomain]] = _nodal(template, d)[node]
-        rows = (d * nodes[:, None] + np.arange(d)).ravel()
-        T = csr_array(self.spread[rows][:, at])
+        T = csr_array(self.torn.spread_to(nodes)[:, at])
         ends = np.arange(nodes.size + 1)
-        K = csr_array(bsr_array((blocks, ends[:-1], ends), shape=(rows.size,) * 2))
+        K = csr_array(bsr_array((blocks, ends[:-1], ends), shape=(d * nodes.size,) * 2))
         return domains.sum(np.asarray(T.multiply(K @ T).sum(axis=0)))
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:

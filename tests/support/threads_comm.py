@@ -24,7 +24,6 @@ import pytest
 from mortarbench.harness.distributed.comm import Comm, _MPIComm
 from mortarbench.problems.feti.operators import DualOperator
 from mortarbench.problems.feti.subdomain_classes import Subdomains
-from mortarbench.problems.feti.substructures import LocalProblems
 
 PATIENCE = 20.0  #: s; a busy machine may stop a thread for seconds
 T = TypeVar("T")
@@ -152,6 +151,5 @@ def unlock(patch: pytest.MonkeyPatch) -> None:
         (DualOperator, "linear_map"),
         (DualOperator, "_blocks"),
         (DualOperator, "_diagonal"),
-        (LocalProblems, "weight"),
     ):
         patch.setattr(vars(owner)[name], "lock", nullcontext(), raising=False)

@@ -13,7 +13,7 @@ from mortarbench.harness.distributed.comm import SERIAL, led
 from mortarbench.harness.mechanics import Real
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.feti.served import Served, operator_of, parts_of
+from mortarbench.problems.feti.served import Served, operator_of
 from mortarbench.problems.feti.subdomains import Contact, TornBodies, subdomain_ranks
 from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.solve import reference_solution
@@ -54,7 +54,7 @@ def built(name, comm):
 def facts(made, s):
     """Return results of a case on rank 0, for given vectors and the answer `s`."""
     lead, torn = made.served.lead, made.served.torn
-    case, parts = made.case(), parts_of(made.served)
+    case, parts = made.case(), made.served.local_problems
     qp, F = case.qp, case.qp.P.build()
     rng = np.random.default_rng(5)
     X, v = rng.standard_normal((qp.q.size, 2)), rng.standard_normal(torn.f.size)

@@ -26,7 +26,7 @@ STAGES = {
         "mortarbench.problems.feti.substructures",
         "LocalProblems.squared_product",
     ),
-    "quantities": ("mortarbench.problems.feti.served", "Served.bulk"),
+    "quantities": ("mortarbench.problems.feti.served", "Served.largest_stresses"),
 }
 KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
 
