@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 from scipy.sparse import csr_array
 
 import mortarbench as mb
@@ -100,6 +101,15 @@ def test_no_member_is_beyond_a_tangent_plane(one, rng):
         assert np.abs(slack[:k][moved]).max(initial=0) <= 1e-14
         length = np.sqrt((normals.toarray() ** 2).sum(axis=0))
         assert length[:k][moved] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("one", [CONES, Cones([[3, 7], [5, 0]], [1.0, 0.25])])
+def test_normals_at_the_apex_span_the_polar_cone(one, rng):
+    """Sixteen directions miss a tangential part by at most 1 − cos(π/16)."""
+    normals, _ = one.normals(np.zeros(N))
+    for v in points(rng, 50):
+        z = v - one.project(v)
+        assert nnls(normals.toarray(), z)[1] <= 0.02 * np.linalg.norm(z) + 1e-12
 
 
 def test_bounds_are_substituted_with_their_variables(rng):
