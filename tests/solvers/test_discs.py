@@ -8,7 +8,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import aslinearoperator
 
 import mortarbench as mb
-from mortarbench.harness import QP, Box, Cones, Discs, Solution, Status
+from mortarbench.harness import QP, Box, Discs, Solution, Status
 from mortarbench.solvers import SOLVERS
 from tests.support.discs import mindlin, natural_map, qp_on_cones, qp_on_discs
 from tests.support.slow_seeds import seeds
@@ -94,15 +94,6 @@ def test_a_disc_of_one_variable_is_a_bound_with_the_same_counts(name):
     assert [type(one) for one in discs.sets] == [Box]
     assert s.counts == other.counts
     assert (s.x == other.x).all()
-
-
-@pytest.mark.parametrize("name", ON_CONES)
-def test_the_degenerate_cone_is_solved_to_half_of_the_digits(name):
-    """The multiplier is zero, although x = (4, 4, 0) is on the boundary of the cone."""
-    qp = QP.from_arrays(np.eye(3), [-4, -4, 0], sets=(Cones([[0, 1, 2]], [1.0]),))
-    s = solve(name, qp)
-    assert s.status is Status.SOLVED
-    assert s.x == pytest.approx([4, 4, 0], abs=4 * np.sqrt(TOL))
 
 
 @pytest.mark.parametrize("name", SMALBES)

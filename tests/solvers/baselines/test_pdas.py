@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness import QP, Status
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
@@ -17,20 +17,6 @@ from mortarbench.solvers.common.infeasibility_certificate import (
     proves_unbounded,
 )
 from mortarbench.solvers.reference.solve import reference_solution
-
-
-def quadratic(
-    P, q, *, A=None, b=(), G=None, h=(), lb=-np.inf, ub=np.inf, store=np.asarray
-):
-    q = np.asarray(q, dtype=float)
-    n = q.size
-    lb, ub = (np.broadcast_to(v, n).astype(float) for v in (lb, ub))
-    A, G = (
-        no_rows(n) if M is None else store(np.asarray(M, dtype=float)) for M in (A, G)
-    )
-    b, h = np.asarray(b, dtype=float), np.asarray(h, dtype=float)
-    P = store(np.asarray(P, dtype=float))
-    return QP(P=P, q=q, A=A, b=b, G=G, h=h, lb=lb, ub=ub)
 
 
 def solve(qp, tol=1e-9):
@@ -49,7 +35,7 @@ CYCLES = {
 
 @pytest.fixture(params=CYCLES.values(), ids=CYCLES)
 def cycling(request):
-    return quadratic(*request.param, lb=0.0)
+    return QP.from_arrays(*request.param, lb=0.0)
 
 
 def dual(seed, n=30, r=3):
@@ -60,14 +46,14 @@ def dual(seed, n=30, r=3):
     W = rng.standard_normal((n, n - 2))
     G, x = rng.standard_normal((r, n)), np.abs(rng.standard_normal(n))
     lb = np.where(np.arange(n) < n // 2, -np.inf, 0.0)
-    return quadratic(W @ W.T / n, rng.standard_normal(n), A=G, b=G @ x, lb=lb)
+    return QP.from_arrays(W @ W.T / n, rng.standard_normal(n), A=G, b=G @ x, lb=lb)
 
 
 def test_the_two_sided_box_is_crossed_in_three_solves():
     """The iterates are 0 at the lower bound, the free minimum 10, and the
     upper bound.
     """
-    s = solve(quadratic([[1.0]], [-10.0], lb=0.0, ub=1.0))
+    s = solve(QP.from_arrays([[1.0]], [-10.0], lb=0.0, ub=1.0))
 
     assert s.x == 1
     assert s.z_box == pytest.approx([9])
@@ -76,7 +62,7 @@ def test_the_two_sided_box_is_crossed_in_three_solves():
 
 
 def test_separate_variables_settle_after_one_change_each():
-    qp = quadratic(np.diag([1.0, 2, 4, 1]), [-1.0, -4, 8, 3], lb=0.0)
+    qp = QP.from_arrays(np.diag([1.0, 2, 4, 1]), [-1.0, -4, 8, 3], lb=0.0)
     s = solve(qp)
 
     assert s.x == pytest.approx([1, 2, 0, 0], abs=1e-8)
@@ -89,7 +75,7 @@ def test_violated_contact_rows_are_added():
     """For min ½‖x‖² − x₁ − 2x₂ with x₁ ≤ 0.5, x₂ ≤ 3, no row is active in the first
     iterate, and the first row is active in the second iterate.
     """
-    qp = quadratic(np.eye(2), [-1.0, -2], G=np.eye(2), h=[0.5, 3.0])
+    qp = QP.from_arrays(np.eye(2), [-1.0, -2], G=np.eye(2), h=[0.5, 3.0])
     s = solve(qp)
 
     assert s.x == pytest.approx([0.5, 2])
@@ -99,7 +85,7 @@ def test_violated_contact_rows_are_added():
 
 
 def test_a_fixed_variable_is_never_released():
-    s = solve(quadratic(np.eye(2), [-5.0, -1], lb=[2.0, -9], ub=[2.0, 9]))
+    s = solve(QP.from_arrays(np.eye(2), [-5.0, -1], lb=[2.0, -9], ub=[2.0, 9]))
 
     assert s.x == pytest.approx([2, 1])
     assert s.z_box == pytest.approx([3, 0], abs=1e-8)
@@ -108,7 +94,9 @@ def test_a_fixed_variable_is_never_released():
 
 def test_a_row_whose_only_free_variable_is_stiff_gets_a_larger_weight():
     """x₁ is at its bound. With the weight of the soft x₁, x₂ would not converge."""
-    qp = quadratic(np.diag([1.0, 1e8]), [1.0, 0], A=[[1, 1]], b=[1.0], ub=[0.0, np.inf])
+    qp = QP.from_arrays(
+        np.diag([1.0, 1e8]), [1.0, 0], A=[[1, 1]], b=[1.0], ub=[0.0, np.inf]
+    )
     s = solve(qp)
 
     assert s.status is Status.SOLVED
@@ -191,7 +179,7 @@ def test_scaled_repeated_and_zero_rows_change_no_answer():
          "row", "singular", "linear"],
 )  # fmt: skip
 def test_degenerate_problems_have_their_solutions(arrays, x, store):
-    qp = quadratic(**arrays, store=store)
+    qp = QP.from_arrays(**arrays | {"P": store(arrays["P"])})
     s = solve(qp)
 
     assert s.status is Status.SOLVED
@@ -202,11 +190,11 @@ def test_degenerate_problems_have_their_solutions(arrays, x, store):
 @pytest.mark.parametrize(
     "qp",
     [
-        quadratic(np.eye(3), np.ones(3), A=[[1, 1, 0], [2, 2, 0]], b=[1, 3]),
-        quadratic(np.eye(2), [1.0, 1], A=[[1, 1]], b=[5.0], lb=0.0, ub=1.0),
-        quadratic(np.eye(2), [0.0, 0], A=[[1, 1]], b=[-1.0], lb=0.0),
-        quadratic(np.eye(2), [0.0, 0], G=[[1, -1], [-1, 1]], h=[-1, -1]),
-        quadratic(np.eye(3), np.ones(3), A=[[1, 2, 3]], b=[7.0], lb=1.0, ub=1.0),
+        QP.from_arrays(np.eye(3), np.ones(3), A=[[1, 1, 0], [2, 2, 0]], b=[1, 3]),
+        QP.from_arrays(np.eye(2), [1.0, 1], A=[[1, 1]], b=[5.0], lb=0.0, ub=1.0),
+        QP.from_arrays(np.eye(2), [0.0, 0], A=[[1, 1]], b=[-1.0], lb=0.0),
+        QP.from_arrays(np.eye(2), [0.0, 0], G=[[1, -1], [-1, 1]], h=[-1, -1]),
+        QP.from_arrays(np.eye(3), np.ones(3), A=[[1, 2, 3]], b=[7.0], lb=1.0, ub=1.0),
     ],
     ids=["rows", "box", "half space", "inequalities", "all fixed"],
 )
@@ -220,7 +208,7 @@ def test_problems_without_a_feasible_point_are_reported(qp):
 
 @pytest.mark.parametrize("store", [np.asarray, csr_array], ids=["dense", "sparse"])
 def test_an_unbounded_objective_is_reported(store):
-    qp = quadratic([[1, 0], [0, 0]], [1.0, -1], lb=[0, 0], store=store)
+    qp = QP.from_arrays(store([[1, 0], [0, 0]]), [1, -1], lb=0)
     s = solve(qp)
 
     assert s.status is Status.UNBOUNDED
@@ -228,7 +216,8 @@ def test_an_unbounded_objective_is_reported(store):
 
 
 def test_an_indefinite_P_is_a_failure():
-    s = solve(quadratic([[1, 2], [2, 1]], [1.0, 1]))
+    qp = QP.from_arrays(np.eye(2), [1, 1])
+    s = solve(replace(qp, P=np.array([[1.0, 2], [2, 1]])))
 
     assert s.status is Status.FAILED
     assert "not positive semidefinite" in s.message
@@ -264,7 +253,7 @@ def test_without_an_objective_a_feasible_point_is_found():
 
 
 def test_a_certificate_must_hold():
-    qp = quadratic(np.eye(2), [0.0, 0], A=[[1, 1]], b=[-1.0], lb=0.0)
+    qp = QP.from_arrays(np.eye(2), [0.0, 0], A=[[1, 1]], b=[-1.0], lb=0.0)
     feasible = replace(qp, b=np.array([1.0]))
     y, none = np.array([1.0]), np.zeros(0)
 
@@ -275,7 +264,7 @@ def test_a_certificate_must_hold():
 
 
 def test_a_direction_of_descent_must_be_free_of_curvature_and_constraints():
-    qp = quadratic(np.diag([1.0, 0]), [-1.0, -1], lb=0.0)
+    qp = QP.from_arrays(np.diag([1.0, 0]), [-1.0, -1], lb=0.0)
     down = np.array([0.0, 1])
 
     assert proves_unbounded(qp, down)

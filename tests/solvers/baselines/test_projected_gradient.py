@@ -7,16 +7,9 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness import QP, Status
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers.baselines.projected_gradient import ProjectedGradient
-
-
-def boxed(P, q, lb=-np.inf, ub=np.inf):
-    P, q = np.asarray(P, dtype=float), np.asarray(q, dtype=float)
-    lb, ub = (np.broadcast_to(v, q.size).astype(float) for v in (lb, ub))
-    none = no_rows(q.size), np.zeros(0)
-    return QP(P=P, q=q, A=none[0], b=none[1], G=none[0], h=none[1], lb=lb, ub=ub)
 
 
 def solve(qp, tol=1e-9):
@@ -26,19 +19,19 @@ def solve(qp, tol=1e-9):
 def random(seed, n=30):
     rng = np.random.default_rng(seed)
     W = rng.standard_normal((n, n))
-    return boxed(W @ W.T / n, rng.standard_normal(n), lb=0.0, ub=1.0)
+    return QP.from_arrays(W @ W.T / n, rng.standard_normal(n), lb=0.0, ub=1.0)
 
 
 @pytest.mark.parametrize(
     ("qp", "x"),
     [
-        (boxed([[1.0]], [-10.0], lb=0.0, ub=1.0), [1]),
-        (boxed(np.eye(3), np.zeros(3), lb=0.0), [0, 0, 0]),
-        (boxed(np.eye(3), np.zeros(3), lb=[1.0, -1, -np.inf]), [1, 0, 0]),
-        (boxed(np.eye(3), np.ones(3), lb=0.0), [0, 0, 0]),
-        (boxed(np.eye(3), -np.ones(3), lb=0.0), [1, 1, 1]),
-        (boxed(np.eye(2), [5.0, -1], lb=[2.0, -9], ub=[2.0, 9]), [2, 1]),
-        (boxed([[1, 0], [0, 0]], [-1.0, 1], lb=-3.0), [1, -3]),
+        (QP.from_arrays([[1.0]], [-10.0], lb=0.0, ub=1.0), [1]),
+        (QP.from_arrays(np.eye(3), np.zeros(3), lb=0.0), [0, 0, 0]),
+        (QP.from_arrays(np.eye(3), np.zeros(3), lb=[1.0, -1, -np.inf]), [1, 0, 0]),
+        (QP.from_arrays(np.eye(3), np.ones(3), lb=0.0), [0, 0, 0]),
+        (QP.from_arrays(np.eye(3), -np.ones(3), lb=0.0), [1, 1, 1]),
+        (QP.from_arrays(np.eye(2), [5.0, -1], lb=[2.0, -9], ub=[2.0, 9]), [2, 1]),
+        (QP.from_arrays([[1, 0], [0, 0]], [-1.0, 1], lb=-3.0), [1, -3]),
     ],
     ids=["two-sided", "q = 0", "q = 0, shifted bound", "all active", "none active",
          "fixed", "singular"],
@@ -53,7 +46,7 @@ def test_degenerate_problems_have_their_solutions(qp, x):
 
 def test_the_first_step_is_that_of_the_exact_line_search():
     """For P = cI, one step of length 1/c reaches the minimiser."""
-    s = solve(boxed(7 * np.eye(3), [1.0, -2, 3]))
+    s = solve(QP.from_arrays(7 * np.eye(3), [1.0, -2, 3]))
 
     assert s.x == pytest.approx([-1 / 7, 2 / 7, -3 / 7], rel=1e-12)
     assert s.iterations == 1
@@ -62,7 +55,7 @@ def test_the_first_step_is_that_of_the_exact_line_search():
 def test_the_lengths_are_those_of_barzilai_and_borwein():
     """Without bounds, every length is the Cauchy length of the previous gradient."""
     P, g, x = np.diag([1.0, 4]), np.array([1.0, 4]), np.zeros(2)
-    qp = boxed(P, g)
+    qp = QP.from_arrays(P, g)
     length = g @ g / (g @ P @ g)
     for _ in range(4):
         previous = g
@@ -132,7 +125,7 @@ def test_operators_are_accepted_and_rows_are_declined(manufactured):
 
 
 def test_an_unbounded_objective_is_reported():
-    s = solve(boxed([[1, 0], [0, 0]], [1.0, -1], lb=0.0))
+    s = solve(QP.from_arrays([[1, 0], [0, 0]], [1.0, -1], lb=0.0))
 
     assert s.status is Status.UNBOUNDED
     assert "unbounded below" in s.message

@@ -177,11 +177,7 @@ def test_every_kind_of_multiplier_has_its_sign_and_size():
 
 def test_the_multipliers_of_repeated_constraints_share_the_force():
     """A bound, two rows and an equation impose x = 1 against q = −9."""
-    qp = QP(
-        P=np.eye(1), q=np.array([-9.0]), A=np.ones((1, 1)), b=np.ones(1),
-        G=np.array([[1.0], [2.0]]), h=np.array([1.0, 2.0]),
-        lb=-np.ones(1), ub=np.ones(1),
-    )  # fmt: skip
+    qp = QP.from_arrays([[1]], [-9], A=[[1]], b=1, G=[[1], [2]], h=[1, 2], lb=-1, ub=1)
     s = reference_solution(qp)
 
     assert s.x.tolist() == [1.0]
@@ -331,10 +327,7 @@ def test_ill_conditioning_costs_no_digit_of_the_residuals(digits):
     x = np.where(np.arange(40) % 2, rng.exponential(size=40), 0.0)
     pushed = np.where(x == 0, rng.exponential(size=40), 0.0)
     A = rng.standard_normal((3, 40))
-    qp = QP(
-        P=(P + P.T) / 2, q=pushed - P @ x, A=A, b=A @ x, G=no_rows(40), h=np.zeros(0),
-        lb=np.zeros(40), ub=np.full(40, np.inf),
-    )  # fmt: skip
+    qp = QP.from_arrays((P + P.T) / 2, pushed - P @ x, A=A, b=A @ x, lb=0)
 
     assert kkt_residuals(qp, reference_solution(qp)).worst <= 1e-13
 
@@ -423,11 +416,7 @@ def test_a_qp_without_a_solution_raises(make):
 
 
 def test_a_qp_whose_variables_are_all_fixed_is_solved():
-    fixed = QP(
-        P=np.eye(2), q=np.ones(2), A=no_rows(2), b=np.zeros(0), G=no_rows(2),
-        h=np.zeros(0), lb=np.ones(2), ub=np.ones(2),
-    )  # fmt: skip
-    s = reference_solution(fixed)
+    s = reference_solution(QP.from_arrays(np.eye(2), [1, 1], lb=1, ub=1))
 
     assert s.x.tolist() == [1, 1]
     assert s.z_box.tolist() == [-2, -2]
