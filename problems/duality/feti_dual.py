@@ -49,9 +49,9 @@ class TornDual:
         """K⁺f (N,), the displacement without multipliers."""
         return np.asarray(self.served.lead("domains.inverse", self.torn.f))
 
-    @cached_property
+    @property
     def R(self) -> csr_array:
-        """Rigid motions (N, r) of all subdomains."""
+        """Rigid motions (N, r) of all subdomains; not stored, since they are large."""
         kernel: csr_array = self.served.lead("domains.kernel")
         return kernel
 
@@ -67,12 +67,12 @@ class TornDual:
     @cached_property
     def qp(self) -> QP:
         """The dual QP."""
-        B, c, _ = self.torn.rows
+        (B, c, _), R = self.torn.rows, self.R
         return QP(
             P=operator_of(self.served),
             q=c - B @ self.free,
-            A=csr_array((B @ self.R).T),
-            b=self.R.T @ self.torn.f,
+            A=csr_array((B @ R).T),
+            b=R.T @ self.torn.f,
             sets=self.sets,
         )
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, lapack
-from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
+from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze, cholesky
 
 from mortarbench.harness import Vector
@@ -208,15 +208,21 @@ class Subdomains:
 
     def kernel(self) -> csr_array:
         """Return R = diag(R_1 … R_S) (N, r), the rigid motions of all subdomains."""
-        return self._kernel
-
-    @cached_property
-    def _kernel(self) -> csr_array:
         blocks = self.comm.gather({k: self.template(k).R for k, _ in self.own})
         R_of = {k: R for one in blocks for k, R in one.items()}
         if not R_of:
             return csr_array((0, 0))
-        return csr_array(block_diag([csr_array(R_of[k]) for k in self.class_of]))
+        of = [R_of[k] for k in self.class_of.tolist()]
+        modes, size = np.array([R_s.shape[1] for R_s in of]), np.diff(self.start)
+        # numbers of entries and first columns of all rows
+        width, first = (np.repeat(v, size) for v in (modes, np.cumsum(modes) - modes))
+        ends = np.append(0, np.cumsum(width)).astype(np.int32)
+        column = np.arange(ends[-1], dtype=np.int32)
+        column += np.repeat((first - ends[:-1]).astype(np.int32), width)
+        data = np.concatenate([R_s.ravel() for R_s in of])
+        R = csr_array((data, column, ends), shape=(size.sum(), modes.sum()))
+        R.eliminate_zeros()
+        return R
 
     def sum(self, part: NDArray[Any]) -> NDArray[Any]:
         """Return the sum of the contributions of all ranks, on rank 0."""

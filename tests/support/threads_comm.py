@@ -23,7 +23,6 @@ import pytest
 
 from mortarbench.harness.distributed.comm import Comm, _MPIComm
 from mortarbench.problems.feti.operators import DualOperator
-from mortarbench.problems.feti.subdomain_classes import Subdomains
 
 PATIENCE = 20.0  #: s; a busy machine may stop a thread for seconds
 T = TypeVar("T")
@@ -147,7 +146,6 @@ def unlock(patch: pytest.MonkeyPatch) -> None:
     for all instances.
     """
     for owner, name in (
-        (Subdomains, "_kernel"),
         (DualOperator, "linear_map"),
         (DualOperator, "_blocks"),
         (DualOperator, "_diagonal"),
