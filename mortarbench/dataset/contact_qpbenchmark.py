@@ -23,43 +23,35 @@ class ContactQpbenchmark(TestSet):
     title = "Contact problems"
     description = "Elastic contact problems with proven optima, of order one."
     sparse_only = False
-
-    def accepts(self, row: dict[str, str]) -> bool:
-        """Return True if a problem, a line of the catalogue, is in this set."""
-        return row["core"] == "yes"
+    column = "core"  #: column of the catalogue that is ``yes`` for members
 
     def __iter__(self) -> Iterator[Problem]:
         """Yield the problems in the order of the catalogue."""
         with (FOLDER / "catalogue.csv").open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         for row in rows:
-            single = row["kind"] == "optimal" and not int(row["discs"] or 0)
-            if single and not row["sequence"] and self.accepts(row):
+            has_optimum = row["kind"] == "optimal" and row["discs"] == "0"
+            is_member = row.get(self.column, "yes") == "yes"
+            if has_optimum and is_member and not row["sequence"]:
                 yield load(FOLDER / row["path"], row["name"])
 
 
 class ContactEvery(ContactQpbenchmark):
     """All single problems."""
 
-    def accepts(self, row: dict[str, str]) -> bool:
-        """Return True."""
-        return True
+    column = ""
 
 
-class ContactDense(ContactEvery):
+class ContactDense(ContactQpbenchmark):
     """Problems with a dense P, which are the duals."""
 
-    def accepts(self, row: dict[str, str]) -> bool:
-        """Return True if P is dense."""
-        return row["dense"] == "yes"
+    column = "dense"
 
 
-class ContactStrictlyConvex(ContactEvery):
+class ContactStrictlyConvex(ContactQpbenchmark):
     """Problems whose P has no eigenvalue that is small by comparison."""
 
-    def accepts(self, row: dict[str, str]) -> bool:
-        """Return True if P has full rank."""
-        return row["strictly_convex"] == "yes"
+    column = "strictly_convex"
 
 
 def load(path: Path, name: str) -> Problem:

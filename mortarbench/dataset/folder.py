@@ -5,11 +5,13 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from mortarbench.dataset.items import (
+    BITS,
     CATALOGUE,
     HERE,
     Row,
@@ -23,7 +25,7 @@ from mortarbench.harness import InputError, checked
 from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.files.qpfile import load_qp, save_qp
-from mortarbench.harness.files.store import read_arrays, write_arrays
+from mortarbench.harness.files.store import Arrays, read_arrays, write_arrays
 from mortarbench.registries import one_thread
 
 CHECKSUMS = "CHECKSUMS"
@@ -90,7 +92,8 @@ def build(
         for name, kind in TEST_SETS.items():
             text = f"from contact_qpbenchmark import {kind} as {kind}\n"
             (folder / name).write_text(text, "utf-8")
-        lines = [f"{_digest(folder / p)}  {p}\n" for p in _summed(rows)]
+        names = [CATALOGUE, *COPIED, *TEST_SETS, *(row["path"] for row in rows)]
+        lines = [f"{_digest(folder / name)}  {name}\n" for name in names]
         (folder / CHECKSUMS).write_text("".join(lines), "utf-8")
     if differing:
         raise InputError(
@@ -118,33 +121,27 @@ def check(folder: str | Path) -> tuple[str, ...]:
         found = [f"{row['path']}: {text}" for row in rows for text in _wrong(path, row)]
     sums = path / CHECKSUMS
     lines = sums.read_text("utf-8").splitlines() if sums.is_file() else []
-    if missing := {*_summed(rows)} - {line.partition("  ")[2] for line in lines}:
-        found.append(f"{CHECKSUMS}: no line for {min(missing)}")
-    known = {row["path"] for row in rows}
-    for digest, _, name in (line.partition("  ") for line in lines):
-        if name not in known and _digest(path / name) != digest:
+    for name in (CATALOGUE, *COPIED, *TEST_SETS):
+        if f"{_digest(path / name)}  {name}" not in lines:
             found.append(f"{name}: missing, or changed since the build")
     return tuple(found)
 
 
 def info() -> dict[str, Any]:
-    """Return numbers of problems, sequences and sizes of the published set."""
+    """Return numbers of problems, sequences and classes of the published set."""
     rows = catalogue()
     single = [row for row in rows if not row["sequence"]]
     core = [row for row in single if row["core"] == "yes"]
     sizes = sorted(int(row["n"]) for row in rows)
-    steps = Counter(row["sequence"] for row in rows if row["sequence"])
+    classes = ("dense", "strictly_convex", "shifted")
     return {
         "core": len(core),
         "problems": len(single),
         "families": dict(Counter(row["family"] for row in core)),
-        "sequences": dict(steps),
+        "sequences": dict(Counter(r["sequence"] for r in rows if r["sequence"])),
         "kinds": dict(Counter(row["kind"] for row in single)),
-        "variables": (sizes[0], sizes[len(sizes) // 2], sizes[-1]),
-        "dense": sum(row["dense"] == "yes" for row in rows),
-        "strictly convex": sum(row["strictly_convex"] == "yes" for row in rows),
-        "discs": sum(row["discs"] != "0" for row in rows),
-        "stored bits": sum(bool(row["stored"]) for row in rows),
+        "variables": f"{sizes[0]} to {sizes[-1]}, median {sizes[len(sizes) // 2]}",
+        "classes": {name: sum(r[name] == "yes" for r in rows) for name in classes},
     }
 
 
@@ -156,13 +153,19 @@ def store_problem(row: Row) -> str:
 
 def _stored(row: Row, path: Path) -> str:
     """Build the problem of an item, write it to `path`, and return its digest."""
-    bits = read_arrays(HERE / "bits.npz", ())
-    own = {k: bits[f"{row['name']}/{k}"] for k in row["stored"].split()}
+    start = f"{row['name']}/"
+    own = {k.removeprefix(start): v for k, v in _bits().items() if k.startswith(start)}
     qp = standard_qp(row, own)
     meta = {k: row[k] for k in ("name", "case", "change", "kind", "optimum", "bound")}
     path.parent.mkdir(parents=True, exist_ok=True)
     save_qp(path, qp, meta | _energy(row))
     return _digest(path)
+
+
+@cache
+def _bits() -> Arrays:
+    """Return the stored bits of all items."""
+    return read_arrays(HERE / BITS, ())
 
 
 def _energy(row: Row) -> dict[str, float]:
@@ -188,11 +191,6 @@ def _wrong(folder: Path, row: Row) -> Iterator[str]:
 
 def _certificate_path(folder: Path, row: Row) -> Path:
     return folder / "certificates" / row["path"]
-
-
-def _summed(rows: list[Row]) -> list[str]:
-    """Return the files with checksums: all but certificates, which prove themselves."""
-    return [CATALOGUE, *COPIED, *TEST_SETS, *(row["path"] for row in rows)]
 
 
 def _digest(path: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,8 +16,8 @@ from scipy.sparse import csc_array, diags_array
 from mortarbench.case import Case, as_case
 from mortarbench.dataset.optimum import (
     UnprovenError,
-    inner_point,
     optimum_interval,
+    tightened,
 )
 from mortarbench.dataset.standard import Scales, rounded, scaled
 from mortarbench.harness import QP, InputError
@@ -37,11 +38,12 @@ Certificate = Mapping[str, Vector]
 
 HERE = Path(__file__).parent
 CATALOGUE = "catalogue.csv"
+BITS = "bits.npz"  #: last bits of arrays, by the name of the item and the array
 COLUMNS = (
     "name", "path", "digest", "core", "family", "sequence", "step", "kind",
     "dense", "strictly_convex", "discs", "n", "equalities", "inequalities", "bounds",
     "nnz", "condition", "rank", "active_share", "degeneracy", "optimum", "bound",
-    "scales", "shifted", "stored", "energy_scale", "energy_constant", "units",
+    "scales", "shifted", "energy_scale", "energy_constant", "units",
     "licence", "case", "change", "provenance",
 )  # fmt: skip
 OPTIMAL, INFEASIBLE, UNBOUNDED = "optimal", "infeasible", "unbounded"
@@ -68,12 +70,13 @@ def catalogue(folder: Path = HERE) -> list[Row]:
         raise InputError(
             f"{folder}: no {CATALOGUE}; expected a folder of `dataset build`"
         )
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
-        rows = list(reader)
-    if [*(reader.fieldnames or ())] != [*COLUMNS] or any(
-        None in r.values() for r in rows
+    rows: list[Row] = []
+    with (
+        suppress(ValueError, csv.Error),
+        path.open(encoding="utf-8", newline="") as file,
     ):
+        rows = list(csv.DictReader(file, strict=True))
+    if not rows or any(tuple(row) != COLUMNS or None in row.values() for row in rows):
         raise InputError(f"{path}: expected the columns {', '.join(COLUMNS)}")
     return rows
 
@@ -151,8 +154,8 @@ def certificate(kind: str, qp: QP) -> Certificate:
     """
     try:
         if kind == OPTIMAL:
-            s = _solved(qp)
-            return {"x": inner_point(qp, s.x), "y": s.y, "z": s.z}
+            s = _solved(tightened(qp))
+            return {"x": s.x, "y": s.y, "z": s.z}
         if kind == INFEASIBLE and (least := least_violation(qp)) is not None:
             return {"y": least[1], "z": least[2]}
         for ray in steepest_ray(qp):  # a translation, with components 0 and 1

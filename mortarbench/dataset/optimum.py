@@ -20,11 +20,12 @@ interval. Norms and singular values are evaluated in double precision.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import svdvals
-from scipy.sparse import csc_array, csr_array, eye_array, hstack, vstack
+from scipy.sparse import csc_array, csr_array, eye_array
 
 from mortarbench.dataset.standard import curvature_exponents
 from mortarbench.harness import QP
@@ -40,22 +41,14 @@ CURVATURES = tuple(2.0**-k for k in (4, 10, 16, 22, 28, 32))
 #: Least ratio of singular values of A that counts as full rank.
 MIN_RANK = 1e-8
 _EPS = float(np.finfo(Real).eps)
-#: Factor that moves points into discs by more than the rounding error of a norm.
-_INSIDE = 1 - 2.0**-48
+MARGIN = 2.0**-42  #: distance of certified points from limits, for rounding errors
 
 
 class UnprovenError(ArithmeticError):
     """Error for an optimal value that cannot be bounded; the message is a reason."""
 
 
-class Interval(NamedTuple):
-    """Bounds of an optimal value."""
-
-    low: float
-    high: float
-
-
-def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> Interval:
+def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> tuple[float, float]:
     """Return bounds of the optimal value of an explicit QP.
 
     x, y, z : (n,), (m,), (p,) point and multipliers, of any accuracy
@@ -92,7 +85,7 @@ def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> Interval:
             raise UnprovenError("P is not provably positive semidefinite")
         error += ((r[curved] / np.exp2(e[curved])) ** 2).sum() / (2 * curvature)
     low -= support + error + RADIUS * r[~curved].sum()
-    return Interval(float(low), float(high))
+    return float(low), float(high)
 
 
 def least_curvature(P: Any) -> float:
@@ -163,52 +156,20 @@ def _distance(qp: QP, x: Vector) -> float:
     return delta
 
 
-def inner_point(qp: QP, x: Vector) -> Vector:
-    """Return a point near x that satisfies inequalities in spite of rounding errors.
+def tightened(qp: QP) -> QP:
+    """Return a QP whose approximate solutions satisfy the inequalities of `qp`.
 
-    It is between x and s, the point with As = b and |sᵢ − xᵢ| ≤ 1 whose distance τ ≤ 1
-    from the inequalities is the largest. A disc is replaced by a box in it.
-
-    Raises
-    ------
-    UnprovenError
-        If there is no such point.
-
+    Limits are moved inwards by `MARGIN`, in the Euclidean norm, except those of
+    variables that are fixed.
     """
-    # imported here, since scipy.optimize loads slowly
-    from scipy.optimize import linprog
-
-    for one in qp.sets:
-        x = one.project(x)
-        if isinstance(one, Discs):
-            x[one.index] *= _INSIDE
-    if not qp.b.size + qp.h.size:
-        return x
-    lower, upper = (bound.copy() for bound in hull(qp.sets, x.size))
-    free, n, lengths = lower < upper, x.size, _lengths(qp)
-    for one in qp.sets[1:]:
-        lower[one.block] /= np.sqrt(one.index.shape[1])  # type: ignore[attr-defined]
-        upper[one.block] = -lower[one.block]
-    eye = eye_array(n, format="csr")
-    rows, sides = [hstack([csr_array(qp.G), lengths[:, None]])], [qp.h]
-    zeros = np.zeros((qp.b.size, 1))
-    for sign, bound in ((1.0, upper), (-1.0, lower)):
-        k = np.flatnonzero(np.isfinite(bound) & free)
-        rows.append(hstack([sign * eye[k], np.ones((k.size, 1))]))
-        sides.append(sign * bound[k])
-    s = linprog(
-        np.append(np.zeros(n), -1.0),
-        A_ub=csr_array(vstack(rows)),
-        b_ub=np.concatenate(sides),
-        A_eq=csr_array(hstack([csr_array(qp.A), zeros])) if qp.b.size else None,
-        b_eq=qp.b if qp.b.size else None,
-        bounds=[*np.where(free, x + np.array([[-1.0], [1.0]]), x).T, (None, 1.0)],
-    ).x
-    if s is None or s[n] <= 0:
-        raise UnprovenError("the inequalities have no common interior point")
-    over = float(((qp.G @ x - qp.h) / lengths).max(initial=0.0))
-    omega = max(over, 0.0) + 1e-14 * max(1.0, np.abs(x).max())
-    return np.asarray(x + min(4 * omega / (omega + s[n]), 1.0) * (s[:n] - x))
+    margin = MARGIN * (qp.lb < qp.ub)
+    sets = [replace(one, radius=one.radius - MARGIN * (one.radius > 0))
+            for one in qp.sets if isinstance(one, Discs)]  # fmt: skip
+    return replace(
+        qp,
+        h=qp.h - MARGIN * _lengths(qp),
+        sets=(Box(qp.lb + margin, qp.ub - margin), *sets),
+    )
 
 
 def _lengths(qp: QP) -> Vector:

@@ -6,8 +6,8 @@ most four problems of each family. They are chosen by farthest points (Gonzalez 
 standardised features, most of them logarithms: the next problem is the one whose
 nearest chosen problem is the farthest away.
 
-The command writes the catalogue and, in ``bits.npz``, the last bits of all arrays that
-differ between two kernels of OpenBLAS. Packages that are rebuilt then agree.
+The command writes the catalogue and, in ``bits.npz``, the last bits of arrays that
+depend on BLAS. Items that still differ between two kernels of OpenBLAS are left out.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -31,10 +29,10 @@ from scipy.sparse.linalg import eigsh
 from mortarbench.case import as_case
 from mortarbench.dataset.folder import store_problem
 from mortarbench.dataset.items import (
+    BITS,
     HERE,
     INFEASIBLE,
     ITERATION,
-    MAX_BOUND,
     OPTIMAL,
     REVERSED,
     UNBOUNDED,
@@ -63,7 +61,7 @@ from mortarbench.dataset.standard import (
 )
 from mortarbench.harness import QP, InputError
 from mortarbench.harness.errors import say
-from mortarbench.harness.files.store import Arrays, write_arrays
+from mortarbench.harness.files.store import write_arrays
 from mortarbench.harness.suite.suite import load_suite
 from mortarbench.registries import Registries, one_thread
 
@@ -87,8 +85,6 @@ COULOMB_CASES = (
 )
 CAP = 4  #: largest number of problems of a family in the core
 KERNELS = ("Haswell", "Prescott")  #: two kernels of OpenBLAS, for any x86-64 processor
-MAX_ERROR = 100  #: largest difference, in units, that the stored bits correct
-UNIT = ":unit"  #: end of the names of units
 #: Eigenvalues of the scaled P below this fraction of the largest count as zero.
 ZERO = 1e-8
 #: Largest n for which all eigenvalues are computed, and their number for larger n.
@@ -101,56 +97,28 @@ ACTIVE = 1e-7
 def main() -> None:
     """Select the set, and write its catalogue and stored bits."""
     if sys.argv[1:]:  # in another process
-        return _write_numbers(Path(sys.argv[1]), json.load(sys.stdin))
+        rows = json.load(sys.stdin)
+        return print(json.dumps({row["name"]: store_problem(row) for row in rows}))
     rows = sorted(described(), key=lambda row: row["path"])
-    one, other = (numbers_under(kernel, rows) for kernel in KERNELS)
-    rows = [row for row in rows if differing(row, one, other) is not None]
+    write_arrays(HERE / BITS, dict(bit for row in rows for bit in _bits(row)))
+    one, other = (digests_under(kernel, rows) for kernel in KERNELS)
+    rows = [row for row in rows if one[row["name"]] == other[row["name"]]]
     choose_core(rows)
-    bits = dict[str, Any]()
     for row in rows:
-        names = differing(row, one, other) or []
-        row["stored"] = " ".join(names)
-        for name in (f"{row['name']}/{name}" for name in names):
-            bits[name] = last_bits(one[name], one[f"{name}{UNIT}"])
-    write_arrays(HERE / "bits.npz", bits)
-    for row in rows:
-        row["digest"] = store_problem(row)
+        row["digest"] = one[row["name"]]
     write_catalogue(HERE, rows)
     return None
 
 
-def differing(row: Row, one: Arrays, other: Arrays) -> list[str] | None:
-    """Return the arrays of an item that differ between two kernels.
-
-    The result is None if they differ by more than the stored bits correct, for
-    instance because a kernel of a matrix has another basis.
-
-    one, other : results of `numbers_under`
-    """
-    start, found = f"{row['name']}/", list[str]()
-    for name in (k for k in one if k.startswith(start) and not k.endswith(UNIT)):
-        finite, unit = np.isfinite(one[name]), one[f"{name}{UNIT}"]
-        a, b = (np.where(finite, each[name], 0) for each in (one, other))
-        error = float((np.abs(a - b) / unit).max(initial=0.0))
-        if error > MAX_ERROR:
-            say(f"{row['name']} is left out: {name} differs by {error:.0f} units")
-            return None
-        found += [name.removeprefix(start)] * (error > 0)
-    return found
-
-
 def described() -> Iterator[Row]:
     """Yield the lines of all items whose optimum is proven, without their digests."""
-    names = Counter[str]()
     for row in _items():
         try:
             with one_thread():
                 complete = _described(row)
         except (UnprovenError, InputError, ArithmeticError) as e:
             say(f"{row['name']} is left out: {e}")
-            continue
-        names[row["name"]] += 1
-        if names[row["name"]] == 1:
+        else:
             say(row["name"])
             yield complete
 
@@ -231,15 +199,13 @@ def _described(row: Row) -> Row:
 
 
 def _optimum(qp: QP, proof: Certificate) -> Row:
-    """Return the optimum and a bound of its error, 1e-10, 1e-9 or 1e-8 max(1, |f*|)."""
+    """Return the optimum, and a bound of its error of at least 1e-10 max(1, |f*|)."""
     low, high = optimum_interval(qp, proof["x"], proof["y"], proof["z"])
     optimum = float(f"{(low + high) / 2:.12g}")
     size = max(1.0, abs(optimum))
     error = 2 * max(high - optimum, optimum - low) + 1e-12 * size
-    for bound in (1e-10, 1e-9, MAX_BOUND):
-        if error <= bound * size:
-            return {"optimum": repr(optimum), "bound": repr(bound * size)}
-    raise UnprovenError(f"the optimum is proven only to {error:.1e}")
+    bound = max(10 ** np.ceil(np.log10(error / size)), 1e-10) * size
+    return {"optimum": repr(optimum), "bound": repr(float(bound))}
 
 
 def _structure(qp: QP) -> Row:
@@ -329,35 +295,31 @@ def choose_core(rows: Sequence[Row]) -> None:
         open_ &= [r["core"] == "no" and taken[r["family"]] < CAP for r in single]
 
 
-def _write_numbers(path: Path, rows: Sequence[Row]) -> None:
-    """Write the unrounded numbers of all items to an npz file."""
+def _bits(row: Row) -> Iterator[tuple[str, Any]]:
+    """Yield the stored bits of an item: those of all arrays, except of a sparse P."""
     with one_thread():
-        every = {row["name"]: numbers(_scaled(row)) for row in rows}
-    arrays = dict[str, Any]()
-    for name, found in every.items():
-        for k, (vector, unit) in found.items():
-            arrays |= {f"{name}/{k}": vector, f"{name}/{k}{UNIT}": np.asarray(unit)}
-    write_arrays(path, arrays)
+        scales = Scales(*map(int, row["scales"].split()))
+        qp = scaled(original(row["case"], row["change"]), scales)
+    for name, (vector, unit) in numbers(qp).items():
+        if name != "P" or row["dense"] == "yes":
+            yield f"{row['name']}/{name}", last_bits(vector, unit)
 
 
-def _scaled(row: Row) -> QP:
-    scales = Scales(*map(int, row["scales"].split()))
-    return scaled(original(row["case"], row["change"]), scales)
+def digests_under(kernel: str, rows: Sequence[Row]) -> dict[str, str]:
+    """Return the digests of the files of all items, built with a kernel of OpenBLAS.
 
-
-def numbers_under(kernel: str, rows: Sequence[Row]) -> Arrays:
-    """Return the unrounded numbers of all items, and units, with a BLAS kernel."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder, "numbers.npz")
-        subprocess.run(
-            [sys.executable, "-m", "mortarbench.dataset.selection", path],
-            input=json.dumps(rows),
-            env=os.environ | {"OPENBLAS_CORETYPE": kernel},
-            check=True,
-            text=True,
-        )
-        with np.load(path) as data:
-            return dict(data)
+    A digest depends on the kernel if errors exceed what the stored bits correct, for
+    instance because a kernel of a matrix has another basis.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "mortarbench.dataset.selection", "digests"],
+        input=json.dumps(rows),
+        env=os.environ | {"OPENBLAS_CORETYPE": kernel},
+        stdout=subprocess.PIPE,
+        check=True,
+        text=True,
+    )
+    return dict(json.loads(done.stdout))
 
 
 def _yes(flag: bool) -> str:

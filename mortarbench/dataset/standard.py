@@ -69,9 +69,9 @@ def scaled(qp: QP, scales: Scales) -> QP:
     return QP(
         P=P * (a * a * c),
         q=qp.q * (a * c),
-        A=qp.A * (a * e),
+        A=_without_noise(qp.A) * (a * e),
         b=qp.b * e,
-        G=qp.G * (a * g),
+        G=_without_noise(qp.G) * (a * g),
         h=qp.h * g,
         sets=[one.substituted(T, np.zeros(qp.q.size)) for one in qp.sets],
     )
@@ -142,6 +142,16 @@ def curvature_exponents(P: Any) -> Vector:
     with np.errstate(divide="ignore"):
         e: Vector = np.floor(np.log2(np.maximum(diagonal, 0)) / 2 + _THRESHOLD)
     return e
+
+
+def _without_noise(M: Any) -> Any:
+    """Return rows without stored entries that would be rounded to zero."""
+    if not issparse(M) or not M.nnz:
+        return M
+    kept = np.where(np.abs(M.data) > _unit(M.data), M.data, 0)
+    M = csc_array((kept, M.indices.copy(), M.indptr.copy()), shape=M.shape)
+    M.eliminate_zeros()
+    return M
 
 
 def _exponent(value: float) -> float:

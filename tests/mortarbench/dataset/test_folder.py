@@ -184,8 +184,6 @@ def rebuilt_under(kernel, names):
 
 @pytest.mark.parametrize("kernel", ["Haswell", "Prescott", "Nehalem"])
 def test_a_rebuild_under_another_kernel_of_blas_has_the_same_bytes(kernel):
-    rows = {row["name"]: row for row in catalogue()}
-    assert rows["obstacle-n8-dual"]["stored"]
     rebuilt_under(kernel, [*NAMES, "obstacle-n8-dual"])
 
 
@@ -193,15 +191,6 @@ def test_a_rebuild_under_another_kernel_of_blas_has_the_same_bytes(kernel):
 @pytest.mark.parametrize("kernel", ["Sandybridge", "Prescott"])
 def test_the_whole_core_has_the_same_bytes_under_another_kernel(kernel):
     rebuilt_under(kernel, [r["name"] for r in catalogue() if r["core"] == "yes"])
-
-
-def test_arrays_without_stored_bits_are_those_that_do_not_depend_on_blas():
-    from mortarbench.dataset.selection import KERNELS, differing, numbers_under
-
-    rows = few()
-    one, other = (numbers_under(kernel, rows) for kernel in KERNELS)
-    for row in rows:
-        assert row["stored"].split() == differing(row, one, other)
 
 
 def test_bad_folders_are_refused_in_one_line(tmp_path, capsys):

@@ -8,10 +8,11 @@ import pytest
 from mortarbench import QP, Discs
 from mortarbench.dataset.optimum import (
     UnprovenError,
-    inner_point,
     least_curvature,
     optimum_interval,
+    tightened,
 )
+from mortarbench.solvers.reference.solve import reference_solution
 
 
 def box_qp():
@@ -34,7 +35,7 @@ def test_the_interval_at_the_solution_is_narrow_and_contains_the_exact_optimum()
     assert low <= -13 / 32 <= high
     assert high - low < 1e-14
 
-    x = inner_point(plane_qp(), np.array([0.1, 1 / 3 - 0.1]))
+    x = reference_solution(tightened(plane_qp())).x
     low, high = optimum_interval(plane_qp(), x, np.array([-7 / 30]), np.array([4 / 30]))
     assert Fraction(low) <= exact_plane_optimum() <= Fraction(high)
     assert high - low < 1e-12
@@ -57,7 +58,7 @@ def test_discs_and_singular_curvature_are_bounded():
         np.diag([1e-8, 1e-8, 0.0]), [-1.0, 0.0, 0.0], lb=[-np.inf, -np.inf, 0.0],
         sets=[Discs([[0, 1]], [2.0])],
     )  # fmt: skip
-    x = inner_point(disc, np.array([2.0, 0.0, 0.0]))
+    x = np.array([2 - 1e-13, 0.0, 0.0])
     low, high = optimum_interval(disc, x, np.zeros(0), np.zeros(0))
     assert low <= -2 + 2e-8 <= high
     assert high - low < 1e-12
