@@ -61,7 +61,8 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
     except InputError as e:
         return _print_error(str(e))
     except KeyboardInterrupt:
-        goes_on = "; the same command continues" if argv[:1] == ["run"] else ""
+        continues = argv[:1] in (["run"], ["dataset"])
+        goes_on = "; the same command continues" if continues else ""
         _print_error(f"interrupted{goes_on}")
         return 130
     except BrokenPipeError:  # e.g. `mortarbench list solvers | head -1`

@@ -21,7 +21,7 @@ from mortarbench.dataset.items import (
     standard_qp,
     write_catalogue,
 )
-from mortarbench.harness import InputError, checked
+from mortarbench.harness import QP, InputError, checked
 from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.files.qpfile import load_qp, save_qp
@@ -82,11 +82,12 @@ def build(
                 if progress:
                     progress(f"{i}/{len(rows)} {row['name']}")
                 with one_thread():
-                    if _stored(row, path) != row["digest"]:
-                        differing.append(row["path"])
+                    qp = _published(row)
                     proof.parent.mkdir(parents=True, exist_ok=True)
-                    qp, _ = load_qp(path)
+                    # before the problem, whose digest marks a finished item
                     write_arrays(proof, dict(certificate(row["kind"], qp)))
+                    if _saved(row, qp, path) != row["digest"]:
+                        differing.append(row["path"])
         for name in COPIED:
             shutil.copyfile(HERE / name, folder / name)
         for name, kind in TEST_SETS.items():
@@ -148,17 +149,22 @@ def info() -> dict[str, Any]:
 def store_problem(row: Row) -> str:
     """Build an item in a temporary folder, and return the digest of its file."""
     with TemporaryDirectory() as folder, one_thread():
-        return _stored(row, Path(folder, "item.npz"))
+        return _saved(row, _published(row), Path(folder, "item.npz"))
 
 
-def _stored(row: Row, path: Path) -> str:
-    """Build the problem of an item, write it to `path`, and return its digest."""
+def _published(row: Row) -> QP:
+    """Return the QP of an item, with the stored bits."""
     start = f"{row['name']}/"
     own = {k.removeprefix(start): v for k, v in _bits().items() if k.startswith(start)}
-    qp = standard_qp(row, own)
+    return standard_qp(row, own)
+
+
+def _saved(row: Row, qp: QP, path: Path) -> str:
+    """Write the QP of an item to a file, and return the digest of the file."""
     meta = {k: row[k] for k in ("name", "case", "change", "kind", "optimum", "bound")}
+    energy = {"scale": row["energy_scale"], "constant": row["energy_constant"]}
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_qp(path, qp, meta | _energy(row))
+    save_qp(path, qp, meta | {k: float(v) for k, v in energy.items() if v})
     return _digest(path)
 
 
@@ -166,11 +172,6 @@ def _stored(row: Row, path: Path) -> str:
 def _bits() -> Arrays:
     """Return the stored bits of all items."""
     return read_arrays(HERE / BITS, ())
-
-
-def _energy(row: Row) -> dict[str, float]:
-    names = {"scale": "energy_scale", "constant": "energy_constant"}
-    return {key: float(row[name]) for key, name in names.items() if row[name]}
 
 
 def _wrong(folder: Path, row: Row) -> Iterator[str]:
@@ -185,7 +186,7 @@ def _wrong(folder: Path, row: Row) -> Iterator[str]:
     try:
         qp, _ = load_qp(path)
         yield from objections(row, qp, read_arrays(proof, ()))
-    except (InputError, ValueError) as e:
+    except (InputError, ValueError, KeyError) as e:
         yield f"cannot be checked: {e}"
 
 

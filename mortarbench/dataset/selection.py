@@ -1,10 +1,9 @@
 """Selection of the public set: ``python -m mortarbench.dataset.selection``.
 
 Every candidate is built, scaled and rounded; candidates whose optimum is not proven to
-1e-8 are left out, as are those with the same numbers as an earlier one. The core are at
-most four problems of each family. They are chosen by farthest points (Gonzalez 1985) in
-standardised features, most of them logarithms: the next problem is the one whose
-nearest chosen problem is the farthest away.
+1e-8 are left out. The core are at most four problems of each family. They are chosen by
+farthest points (Gonzalez 1985) in standardised features, most of them logarithms: the
+next problem is the one whose nearest chosen problem is the farthest away.
 
 The command writes the catalogue and, in ``bits.npz``, the last bits of arrays that
 depend on BLAS. Items that still differ between two kernels of OpenBLAS are left out.
@@ -17,9 +16,7 @@ import os
 import re
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -275,24 +272,21 @@ def features(row: Row) -> list[float]:
 
 
 def choose_core(rows: Sequence[Row]) -> None:
-    """Set ``core`` of at most `CAP` single problems per family to ``yes``.
+    """Set ``core`` of the `CAP` most different single problems per family to ``yes``.
 
-    The first is the one nearest to the mean. Ties go to the earlier line.
+    The first is the one nearest to the mean of all. Ties go to the earlier line.
     """
     single = [row for row in rows if not row["sequence"]]
     points = np.array([features(row) for row in single])
     points = (points - points.mean(axis=0)) / np.maximum(points.std(axis=0), 1e-12)
-    far = 1 / (1 + np.linalg.norm(points, axis=1))
-    open_, taken = np.ones(len(single), dtype=bool), Counter[str]()
-    for chosen in count():
-        if not open_.any():
-            return
-        i = int(np.argmax(np.where(open_, far, -1.0)))
-        family = single[i]["family"]
-        single[i]["core"], taken[family] = "yes", taken[family] + 1
-        distance = np.linalg.norm(points - points[i], axis=1)
-        far = distance if not chosen else np.minimum(far, distance)
-        open_ &= [r["core"] == "no" and taken[r["family"]] < CAP for r in single]
+    for family in {row["family"] for row in single}:
+        members = [i for i, row in enumerate(single) if row["family"] == family]
+        far = 1 / (1 + np.linalg.norm(points[members], axis=1))
+        for number in range(min(CAP, len(members))):
+            i = members[int(np.argmax(far))]
+            single[i]["core"] = "yes"
+            distance = np.linalg.norm(points[members] - points[i], axis=1)
+            far = np.minimum(far, distance) if number else distance
 
 
 def _bits(row: Row) -> Iterator[tuple[str, Any]]:

@@ -112,23 +112,15 @@ def rounded(qp: QP, bits: Mapping[str, Integers], *, is_shifted: bool) -> QP:
     whole = csc_array(lower + tril(lower, -1).T)
     if is_shifted:
         whole = csc_array(whole + SHIFT * diags_array(np.exp2(2 * e) * (e > -np.inf)))
-    A, G = (
-        csc_array((values[name], M.indices, M.indptr), shape=M.shape)
-        if issparse(M)
-        else values[name].reshape(M.shape)
-        for name, M in (("A", qp.A), ("G", qp.G))
-    )
-    return QP(
-        P=whole if issparse(qp.P) else whole.toarray(),
-        q=values["q"],
-        A=A,
-        b=values["b"],
-        G=G,
-        h=values["h"],
-        lb=values["lb"],
-        ub=values["ub"],
-        sets=further_sets(set_arrays(qp.sets[1:]) | _sizes(values)),
-    )
+    parts: dict[str, Any] = {k: values[k] for k in ("q", "b", "h", "lb", "ub")}
+    for name, M in (("A", qp.A), ("G", qp.G)):
+        if issparse(M):
+            parts[name] = csc_array((values[name], M.indices, M.indptr), shape=M.shape)
+        else:
+            parts[name] = values[name].reshape(M.shape)
+    parts["P"] = whole if issparse(qp.P) else whole.toarray()
+    sets = further_sets(set_arrays(qp.sets[1:]) | _sizes(values))
+    return QP(**parts, sets=sets)
 
 
 def last_bits(vector: Vector, unit: Any) -> NDArray[np.uint8]:
