@@ -105,14 +105,13 @@ cdef extern from "vectors.h" nogil:
 cdef extern from "incomplete.h" nogil:
     int RUN
     ctypedef struct incomplete:
-        Py_ssize_t n, half, reach, count
+        Py_ssize_t n, count, runs, width
         const int *start
         const int *row
         const Py_ssize_t *pair
         const int *target
         const double *below
         const double *diagonal
-        Py_ssize_t width
         const Py_ssize_t *offset
         const int *between
         int *from_ "from"
@@ -120,7 +119,6 @@ cdef extern from "incomplete.h" nogil:
         double *L
         double *pivot
         double *inverse
-        double *bands
         double *y
     void find_runs(incomplete *F, const double *free, Py_ssize_t most)
     bint factorise_incompletely(incomplete *F, const double *free, double keep,

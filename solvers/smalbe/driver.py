@@ -304,8 +304,7 @@ class OuterLoop:
     def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
         """Return x, the multipliers a of Cx = Cx̃, z_box and Fx; takes one product."""
         box = qp.box
-        at = at._replace(nu=self.solver.onto_rows(at.nu), mu=self.multipliers(at))
-        return self.solver.point(at.nu, at.mu, box.lower, box.upper)
+        return self.solver.point(at.nu, self.multipliers(at), box.lower, box.upper)
 
 
 def outer_loop(

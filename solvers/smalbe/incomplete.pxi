@@ -23,15 +23,6 @@ cdef enum:
     LEAST_OFFSET = 8
 
 
-cdef inline bint is_later(Py_ssize_t i, Py_ssize_t j, Py_ssize_t half) noexcept nogil:
-    """Return True if i comes after j in the order 0, …, half − 1, n − 1, …, half."""
-    return i > j if j < half else half <= i < j
-
-
-cdef inline Py_ssize_t distance(Py_ssize_t i, Py_ssize_t j) noexcept nogil:
-    return i - j if i > j else j - i
-
-
 def sparsity(matrix):
     """Return the fields of `solvers.smalbe.preconditioner.Sparsity` for a symmetric P.
 
@@ -91,9 +82,6 @@ cdef class IncompleteFactor:
     cdef const int *indices
     cdef list owners
     cdef Room room
-    cdef Room values
-    cdef int *integers
-    cdef Py_ssize_t *first_pairs
     # (n,) 1 for components that are free in the present factor, else 0
     cdef double *face
     cdef double *wanted  # (n,) mask of a trial face
@@ -106,125 +94,95 @@ cdef class IncompleteFactor:
     cdef readonly long factorisations, solves
 
     def __init__(self, matrix, double scale=1.0, bint keep=True):
-        cdef Py_ssize_t n = matrix.shape[0], i, k, m, entries = 0, pairs = 0, near, used
-        cdef Py_ssize_t offset[16]  # MAX_DIAGONALS
-        cdef Py_ssize_t count = 0, half, reach = 0, far, column, other, stored
+        cdef Py_ssize_t n = matrix.shape[0], i, k, m, entries = 0, pairs = 0, count, used
+        cdef Py_ssize_t stored, reach = 0
         cdef int first, last
-        cdef bint by_bands
-        self.n, self.owners, self.keep = n, [], KEEP if keep else 0.0
+        cdef sparse P
+        self.n, self.owners, self.keep, self.scale = n, [], KEEP if keep else 0.0, scale
         cdef int[::1] indptr = _integers(matrix.indptr)
         cdef int[::1] indices = _integers(matrix.indices)
-        self.indptr, self.indices = &indptr[0], &indices[0]
         cdef const double *data = read(matrix.data, self.owners)
-        # 1. The order of elimination, and the distances of entries from the diagonal.
-        for i in range(n):
-            for k in range(indptr[i], indptr[i + 1]):
-                far = distance(indices[k], i)
-                reach = far if far > reach else reach
-                m = 0
-                while m < count and offset[m] != far:
-                    m += 1
-                if far and m == count:
-                    if count == MAX_DIAGONALS:
-                        count = n + 1  # too many diagonals
-                    else:
-                        offset[count] = far
-                        count += 1
-        half = n // 2 if n >= 4 * reach and n > 1 else n
-        # 2. The total number of entries in later rows, and of pairs of these entries,
-        # over all columns.
-        for i in range(n):
+        cdef Py_ssize_t[::1] offset = np.zeros(MAX_DIAGONALS, dtype=np.intp)
+        cdef signed char[::1] slot = np.empty(n, dtype=np.int8)
+        self.indptr, self.indices = &indptr[0], &indices[0]
+        # 1. Diagonals, if few are nonzero; a run of columns is eliminated at the same
+        # time, so that it must not be longer than the second offset
+        P.n, P.indptr, P.indices, P.data = n, self.indptr, self.indices, data
+        count = find_diagonals(
+            &P, min(indptr[n] // n, MAX_DIAGONALS), &offset[0], &slot[0]
+        ) - 1
+        m = 1 + (count > 0 and offset[1] == 1)
+        self.most = RUN if count > 0 else n
+        if m <= count:
+            self.most = min(RUN, offset[m])
+        if self.most < LEAST_OFFSET:
+            count, self.most = 0, n
+        count = max(count, 0)
+        # 2. The number of entries below the diagonal and of pairs of them in a column.
+        for i in range(0 if count else n):
             used = 0
             for k in range(indptr[i], indptr[i + 1]):
-                used += is_later(indices[k], i, half)
+                used += indices[k] > i
             entries += used
             pairs += used * (used - 1) // 2
-        offsets = np.array(sorted([offset[m] for m in range(count)]) if count <= n else [])
-        near = 1 if len(offsets) and offsets[0] == 1 else 0
-        count = len(offsets)
-        if count * n > 2 * entries + n or count > near and offsets[near] < LEAST_OFFSET:
-            count = 0
-        by_bands = count > 0
-        self.most = n
-        if by_bands:
-            self.most = min(RUN, offsets[near] if count > near else n)
-            pairs, stored = 0, count * (n + reach)
-        else:
-            stored = entries
-        cdef Py_ssize_t[::1] at_offset = np.array(offsets if by_bands else [0], dtype=np.intp)
         # 3. Memory.
-        self.integers = <int *> calloc(
-            5 * n + 3 + (0 if by_bands else entries) + pairs
-            + MAX_DIAGONALS * MAX_DIAGONALS, sizeof(int)
-        )
-        self.first_pairs = <Py_ssize_t *> calloc(n + 1, sizeof(Py_ssize_t))
-        if not self.integers or not self.first_pairs:
-            raise MemoryError
-        cdef int *start = self.integers
+        if count:
+            reach = offset[count]
+        stored = count * (n + reach) if count else entries
+        integers = np.zeros(5 * n + 1 + entries + pairs + MAX_DIAGONALS**2, dtype=np.int32)
+        first_pairs = np.zeros(n, dtype=np.intp)
+        below_diagonal = np.zeros((count + 1) * n if count else n + entries)
+        self.room = Room(stored + 5 * n + reach)
+        cdef int *start = <int *> cnp.PyArray_DATA(integers)
         cdef int *row = start + n + 1
-        cdef int *target = row + (0 if by_bands else entries)
+        cdef int *target = row + entries
         cdef int *between = target + pairs
-        self.F.from_ = between + MAX_DIAGONALS * MAX_DIAGONALS
-        self.F.to, self.queue = self.F.from_ + n, self.F.from_ + 2 * n
-        self.besides = self.F.from_ + 3 * n
-        self.values, self.room = Room(n + stored), Room(stored + 5 * n + reach)
-        cdef double *diagonal = self.values.at
+        cdef Py_ssize_t *pair = <Py_ssize_t *> cnp.PyArray_DATA(first_pairs)
+        cdef double *diagonal = address(below_diagonal)
         cdef double *below = diagonal + n
+        self.owners += [indptr, indices, offset, integers, first_pairs, below_diagonal]
         # 4. The matrix.
+        if count:
+            fill_diagonals(&P, &slot[0], diagonal)
         entries = 0
-        for i in range(n):
+        for i in range(0 if count else n):
             for k in range(indptr[i], indptr[i + 1]):
                 if indices[k] == i:
-                    diagonal[i] = data[k]
-                elif is_later(indices[k], i, half):
-                    if by_bands:
-                        m = 0
-                        while at_offset[m] != distance(indices[k], i):
-                            m += 1
-                        m = m * (n + reach) + i
-                    else:
-                        m, row[entries] = entries, indices[k]
-                        entries += 1
-                    below[m] = data[k]
+                    diagonal[i] += data[k]
+                elif indices[k] > i:
+                    row[entries], below[entries] = indices[k], data[k]
+                    entries += 1
             start[i + 1] = <int> entries
-        # 5. The entry that couples two later rows of a column, if it exists. This entry
-        # is stored in the column of the row that is eliminated first.
+        # 5. The entry that couples two later rows of a column, if it exists.
         for m in range(count):
             for k in range(count):
                 between[m * MAX_DIAGONALS + k] = -1
                 for i in range(count):
-                    if at_offset[i] == distance(at_offset[m], at_offset[k]):
+                    if offset[i + 1] == offset[k + 1] - offset[m + 1]:
                         between[m * MAX_DIAGONALS + k] = <int> i
         pairs = 0
-        for i in range(0 if by_bands else n):
-            self.first_pairs[i] = pairs
+        for i in range(0 if count else n):
+            pair[i] = pairs
             for k in range(start[i], start[i + 1]):
                 for m in range(k + 1, start[i + 1]):
-                    column, other = row[k], row[m]
-                    if not is_later(other, column, half):
-                        column, other = other, column
-                    first, last = start[column], start[column + 1]
-                    while first < last and row[first] < other:
+                    first, last = start[row[k]], start[row[k] + 1]
+                    while first < last and row[first] < row[m]:
                         first += 1
                     target[pairs] = -1
-                    if first < last and row[first] == other:
+                    if first < last and row[first] == row[m]:
                         target[pairs] = first
                     pairs += 1
-        self.owners += [indptr, indices, at_offset]
-        self.F.n, self.F.half, self.F.reach, self.F.count = n, half, reach, count
-        self.F.width, self.F.offset, self.F.between = n + reach, &at_offset[0], between
-        self.F.start, self.F.row, self.F.target = start, row, target
-        self.F.pair, self.F.below, self.F.diagonal = self.first_pairs, below, diagonal
-        self.scale = scale
-        self.F.L = self.F.bands = self.room.at
+        self.F.n, self.F.count, self.F.width = n, count, n + reach
+        self.F.offset, self.F.between = &offset[1], between
+        self.F.start, self.F.row, self.F.target, self.F.pair = start, row, target, pair
+        self.F.below, self.F.diagonal, self.F.L = below, diagonal, self.room.at
+        self.F.from_ = between + MAX_DIAGONALS * MAX_DIAGONALS
+        self.F.to, self.queue = self.F.from_ + n, self.F.from_ + 2 * n
+        self.besides = self.F.from_ + 3 * n
         self.F.pivot = self.F.L + stored
         self.F.inverse = self.F.pivot + n + reach
         self.F.y, self.face = self.F.inverse + n, self.F.inverse + 2 * n
         self.wanted = self.F.inverse + 3 * n
-
-    def __dealloc__(self):
-        release_memory(self.integers)
-        release_memory(self.first_pairs)
 
     cdef int enter(self, const double *free, bint may_exceed=False) except -1:
         """Factorise on the face with the mask `free` (n,) of free components.

@@ -17,10 +17,6 @@ cdef double MIN_TAIL = 1e-4
 # journal bearings.
 cdef double FIRST_TESTED = 1e3
 cdef double LEAST_TESTED = 1e-2
-# Number of pairs of projections in `onto_rows`. At the tolerance 1e-8, the contact
-# force of a sphere on a plane differs from the load by 3e-9 without projections and by
-# 2e-10 with four pairs. Each pair takes two products with C.
-cdef int ALTERNATIONS = 4
 
 
 @cython.final
@@ -438,37 +434,6 @@ cdef class SMALBE(MPRGP):
         return 0
 
     # recovery
-
-    def onto_rows(self, nu):
-        """Move ν (n,) towards Cν = 0 without leaving its face or taking a product.
-
-        The outer loop ends with a violation ‖Cν‖ of the order of the tolerance. This
-        violation is the error of the force balance, which is visible when users compare
-        contact forces with the load. Projections onto {Cν = 0} and onto the free
-        components alternate (von Neumann). Active bounds and discs therefore remain
-        active, and multipliers remain valid. Each pair of projections multiplies the
-        violation by at most 1 − λ, where λ is the smallest eigenvalue of C_F C_Fᵀ on
-        the free components F. For a sphere on a plane, this factor is 0.5.
-        """
-        cdef Py_ssize_t i, n = self.n
-        cdef list owners = []
-        if not self.rows.exist:
-            return nu
-        moved = empty(n)
-        cdef double *v = address(moved)
-        cdef double *free = self.x2
-        cdef double *t = self.t
-        cdef Parts parts
-        memcpy(v, read(nu, owners), n * sizeof(double))
-        self.set.split(v, v, 1.0, t, free, &parts)
-        for _ in range(ALTERNATIONS):
-            self.rows.times(v, self.Cv)
-            memset(t, 0, n * sizeof(double))
-            self.rows.combine(1.0, self.Cv, t, t)
-            for i in range(n):
-                t[i] *= free[i]
-            self.set.project(v, 1.0, t, v)
-        return moved
 
     def point(self, nu, mu, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.

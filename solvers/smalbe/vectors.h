@@ -81,8 +81,15 @@ static Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *o
             if (count >= most)
                 return 0;
             offset[count++] = o;
-            slot[o] = (signed char) count;
+            slot[o] = 1;
         }
+    for (Py_ssize_t c = 2; c < count; c++) /* in ascending order */
+        for (Py_ssize_t d = c; d > 1 && offset[d] < offset[d - 1]; d--) {
+            Py_ssize_t o = offset[d];
+            offset[d] = offset[d - 1], offset[d - 1] = o;
+        }
+    for (Py_ssize_t c = 0; c < count; c++)
+        slot[offset[c]] = (signed char) c;
     return count;
 }
 
@@ -92,7 +99,7 @@ static void fill_diagonals(const sparse *F, const signed char *slot, double *dia
     for (Py_ssize_t i = 0; i < F->n; i++)
         for (int k = F->indptr[i]; k < F->indptr[i + 1]; k++)
             if (F->indices[k] >= i)
-                diagonals[(slot[F->indices[k] - i] - 1) * F->n + i] += F->data[k];
+                diagonals[slot[F->indices[k] - i] * F->n + i] += F->data[k];
 }
 
 CLONED static double dot(const double *a, const double *b, Py_ssize_t n)

@@ -11,27 +11,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def order_of_elimination(P: Array) -> NDArray[np.intp]:
-    """Return the order of elimination (n,).
-
-    If all entries are within n/4 of the diagonal, elimination proceeds from both ends
-    to the middle, with half of the components on either side. Otherwise it proceeds
-    from one end.
-    """
-    n = len(P)
-    i, j = np.nonzero(P)
-    reach = np.abs(i - j).max(initial=0)
-    half = n // 2 if n >= 4 * reach and n > 1 else n
-    return np.r_[np.arange(half), np.arange(half, n)[::-1]]
-
-
 def incomplete_inverse(P: Array, free: Mask, keep: float) -> Array:
     """Return M⁻¹ (n, n) for M ≈ P_FF, with zero rows and columns off the free set."""
-    order = order_of_elimination(P)
-    order = order[free[order]]
-    L, D = incomplete_cholesky(P[np.ix_(order, order)], keep)
+    face = np.ix_(free, free)
+    L, D = incomplete_cholesky(P[face], keep)
     inverse = np.zeros_like(P)
-    inverse[np.ix_(order, order)] = np.linalg.inv((L * D) @ L.T)
+    inverse[face] = np.linalg.inv((L * D) @ L.T)
     return inverse
 
 
