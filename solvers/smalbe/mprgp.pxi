@@ -188,26 +188,20 @@ cdef class MPRGP:
     A proportioning step is taken if  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient
     φ̃, defined by x − φ̃/τ = Π(x − φ/τ) with the projection Π onto the set.
 
-    A *spectral step* is x ← x + t(Π(x − αg) − x). Its length α = sᵀs/sᵀHs is the
-    Barzilai-Borwein length for the last step s, and t is determined by the nonmonotone
-    line search of Birgin, Martínez and Raydan (SIAM J. Optim. 10, 2000, Algorithm 2.2).
-    Because the boundary of a disc is curved, the number of steps of a fixed length
-    would be proportional to the condition number of H. CG is not suitable while
-    directions of slip change. CG therefore begins on a face only if a step of length α
-    along −φ stays in the set.
-
-    The number of spectral steps is also proportional to the condition number. On a face
-    that no longer changes, *Newton steps* (n) replace spectral steps: x ← Π(x − d),
-    where CG solves T(H + κ)Td = Tg. T is the projector onto the tangents of the
-    boundary, and κ is the product of the curvature of the boundary and the multiplier.
-    A Newton step is taken only if the cost decreases.
+    Over discs, *spectral steps* x ← x + t(Π(x − αg) − x) with the length of Barzilai and
+    Borwein and the nonmonotone line search of Birgin, Martínez and Raydan (SIAM J.
+    Optim. 10, 2000, Algorithm 2.2) replace expansions and proportioning. CG begins on a
+    face only if a step of length α along −φ stays in the set. On a face that no longer
+    changes, *Newton steps* x ← Π(x − d) follow, where CG solves T(H + κ)Td = Tg with
+    the projector T onto the tangents of the boundary and its curvature κ times the
+    multiplier.
 
     Every step decreases the cost, except spectral steps. With the
     model τI, the decrease is at least the amount on which the rate of convergence in
     the book is based. An expansion does not release components that its half step moved
     to the boundary, except the first expansion by a model with directions. Apart from
     this exception, and from spectral and Newton steps, the active set therefore only
-    grows between proportioning steps. docs/smalbe-theory.md discusses the consequences.
+    grows between proportioning steps. docs/smalbe.md discusses the consequences.
     """
 
     cdef Product F

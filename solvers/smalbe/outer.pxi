@@ -11,11 +11,9 @@ cdef double MAX_RHO = 1e10
 # long as the steps of ordinary gradient projection. With zero, an F of low rank leads
 # to τ = 0, so that no step is possible (`test_earlier_failures_do_not_recur`).
 cdef double MIN_TAIL = 1e-4
-# Values of ‖g^P‖ in units of tol‖b‖. The KKT residual is first evaluated below
-# FIRST_TESTED. Below LEAST_TESTED, the inner run ends even if the KKT residual exceeds
-# the tolerance. At a KKT residual of 1e-6, ‖g^P‖/‖b‖ is 1e-4 for strings and 1e-5 for
-# journal bearings.
-cdef double FIRST_TESTED = 1e3
+# Value of ‖g^P‖ in units of tol‖b‖ below which the inner run ends even if the KKT
+# residual exceeds the tolerance. At a KKT residual of 1e-6, ‖g^P‖/‖b‖ is 1e-4 for
+# strings and 1e-5 for journal bearings.
 cdef double LEAST_TESTED = 1e-2
 
 
@@ -45,8 +43,6 @@ cdef class SMALBE(MPRGP):
     cdef const double *b
     cdef const double *q
     cdef const double *diagonal  # NULL for an operator without a diagonal
-    cdef Model cached_model
-    cdef double cached_rho
     cdef double M_now, tol, small_gradient, coarse_gradient
     # (5n,) D⁻¹ᐟ² and workspace of the stopping test
     cdef Room tested
@@ -156,28 +152,15 @@ cdef class SMALBE(MPRGP):
             self.rows.owners.append(basis)
         return 0
 
-    cdef Model model(self, double rho):
-        """Return the model of H with the Ritz pairs and the penalty ρ."""
-        cdef Py_ssize_t i
-        cdef Room w
-        if self.basis is None:
-            return Model.of_norm(self.tail, self.n)
-        if self.cached_model is None or self.cached_rho != rho:
-            w = Room(self.n_directions)
-            for i in range(self.n_directions):
-                w.at[i] = self.above.at[i] + (rho if i < self.rows.r else 0.0)
-            self.cached_model, self.cached_rho = Model.of(self.basis, w.at, 0.0, self.tail), rho
-        return self.cached_model
-
-    cdef Model model_of_penalty(self, double rho):
-        """Return the model I + (ρ − 1)Q of H, without Ritz pairs; I for ρ < 1."""
+    cdef Model model(self, double rho, double tail, bint has_ritz):
+        """Return the model tail·I + (ρ − tail)Q of H, with the Ritz pairs or without."""
         cdef Py_ssize_t i
         cdef Room w = Room(self.n_directions)
-        if not self.rows.exist:
-            return Model.of_norm(1.0, self.n)
-        for i in range(self.rows.r):
-            w.at[i] = rho - 1
-        return Model.of(self.basis, w.at, 0.0, 1.0)
+        if self.basis is None:
+            return Model.of_norm(tail, self.n)
+        for i in range(self.n_directions):
+            w.at[i] = rho - tail if i < self.rows.r else has_ritz * self.above.at[i]
+        return Model.of(self.basis, w.at, 0.0, tail)
 
     cdef int choose_models(self) except -1:
         """Choose the model B and the preconditioner for the present ρ."""
@@ -186,12 +169,12 @@ cdef class SMALBE(MPRGP):
                 fmax(1.0, self.rho if self.rows.exist else 0.0) / self.alpha, self.n
             )
         else:
-            self.B = self.model(self.rho)
+            self.B = self.model(self.rho, self.tail, True)
         self.preconditioner = None
         if self.M is not None:
-            self.preconditioner = self.model_of_penalty(self.penalty_of_M())
+            self.preconditioner = self.model(self.penalty_of_M(), 1.0, False)
         elif self.preconditioned:
-            self.preconditioner = self.model(self.rho)
+            self.preconditioner = self.model(self.rho, self.tail, True)
         return 0
 
     def precondition(self, free, v, double rho):
@@ -294,7 +277,7 @@ cdef class SMALBE(MPRGP):
             self.b_size = sqrt(dot(self.g, self.g, n))
         self.small_gradient = tol * self.b_size
         self.coarse_gradient = options.eta * self.b_size
-        self.next_tested = FIRST_TESTED * self.small_gradient
+        self.next_tested = INFINITY
         self.aim, self.least_gradient = aim or tol, self.small_gradient
         if aim:
             self.least_gradient = LEAST_TESTED * self.entry_gradient
