@@ -305,7 +305,7 @@ cdef class MPRGP:
         self.cost_now, self.n_costs = 0.0, 0
         self.settled = 0
         self.record_cost(0.0)
-        # 1. The face of x, the minimiser along the stored directions on this face, and
+        # Step 0. The face of x, the minimiser along the stored directions on this face, and
         # the first direction of conjugate gradients.
         self.split()
         self.minimise_along_directions()
@@ -316,7 +316,7 @@ cdef class MPRGP:
         self.expected_slope = self.directions.conjugate(self.phi, self.p)
         while True:
             PyErr_CheckSignals()  # so that Ctrl-C ends the loop
-            # 2. Stop if the projected gradient is small, or on stagnation.
+            # Step 5. Return if the projected gradient is small, or on stagnation.
             if self.stops():
                 return 1
             if len(trace) >= most:
@@ -335,7 +335,7 @@ cdef class MPRGP:
                     self.record_step(b"n", trace, note)
                 continue
             if self.parts.beta_square > self.Gamma_square * self.parts.reduced_square:
-                # 3. Proportioning, because releasing components promises a larger
+                # Step 4. Proportioning, because releasing components promises a larger
                 # decrease than a step on the face.
                 idle = idle + 1 if self.parts.beta_square > chopped / 2 else 0
                 chopped = self.parts.beta_square
@@ -343,7 +343,7 @@ cdef class MPRGP:
             elif not inside and self.spectral_step_leaves(begun):
                 letter = b"e" if self.step_spectrally() else 0
             else:
-                # 4. The trial step of conjugate gradients, with α_cg and the largest
+                # Step 1. The trial step of conjugate gradients, with α_cg and the largest
                 # feasible length α_f.
                 self.lengths_along(self.p, self.Hp)
                 if isinf(fmin(self.line.cg, self.line.feasible)) or self.is_spent():
@@ -352,12 +352,12 @@ cdef class MPRGP:
                     inside = 0
                     continue
                 if self.line.cg <= self.line.feasible:
-                    # 5. Conjugate gradient step, and the next direction.
+                    # Step 2. Conjugate gradient step, and the next direction.
                     self.minimise_along_p()
                     self.record_step(b"c", trace, note)
                     inside += 1
                     continue
-                # 6. Expansion: the CG step would leave the set.
+                # Step 3. Expansion: the CG step would leave the set.
                 letter = self.expand(
                     not has_expanded,
                     max(inside, 1 if self.factor is None else BEYOND), began, trace
@@ -366,7 +366,7 @@ cdef class MPRGP:
                 has_expanded = True
             if not letter:
                 return 0
-            # 7. Restart CG on the new face with the preconditioned free gradient. After
+            # Restart CG on the new face with the preconditioned free gradient. After
             # a spectral step, restart only if CG begins on this face.
             inside, began = 0, self.parts.phi_square
             self.phi_square_at_drift = self.phi_square_at_refresh = INFINITY
@@ -411,7 +411,7 @@ cdef class MPRGP:
             note(chr(letter), copied(self.x, self.n), copied(self.g, self.n))
         return 0
 
-    # 1. The face
+    # Step 0. The face
 
     cdef void split(self) noexcept:
         """Compute φ, `free` and `parts` at x."""
@@ -483,7 +483,7 @@ cdef class MPRGP:
         """Return the penalty of the model in a structural preconditioner."""
         return fmax(self.rho, MIN_PROJECTING) if self.set.has_discs else self.rho
 
-    # 3. Proportioning
+    # Step 4. Proportioning
 
     cdef int proportion(self, bint by_model) except -1:
         """Take a step that releases components; return its letter, or 0 without a step.
@@ -548,7 +548,7 @@ cdef class MPRGP:
         self.B = self.B.raised(s, sums[0], sums[1])
         return 0
 
-    # 3, 6. Spectral steps
+    # Steps 3 and 4. Spectral steps
 
     cdef int record_cost(self, double change) noexcept:
         self.cost_now += change
@@ -684,7 +684,7 @@ cdef class MPRGP:
             return line.slope / line.curvature
         return 1.0
 
-    # 4. The trial step
+    # Step 1. The trial step
 
     cdef int H(self, const double *v, double *out) except -1:
         """out ← Hv = 𝒫F𝒫v/‖𝒫F𝒫‖ + ρQv; one product."""
@@ -713,7 +713,7 @@ cdef class MPRGP:
         self.set.lengths(self.x, self.g, p, Hp, &self.line)
         return 0
 
-    # 5. The conjugate gradient step
+    # Step 2. The conjugate gradient step
 
     cdef int minimise_along_p(self) except -1:
         """Take the CG step along `line` and compute the next direction.
@@ -763,7 +763,7 @@ cdef class MPRGP:
                          &self.parts)
         self.knows_Cx = False
 
-    # 6. Expansion
+    # Step 3. Expansion
 
     cdef int expand(
         self, bint is_first, long most, double enough, bytearray trace
@@ -790,6 +790,7 @@ cdef class MPRGP:
             self.split()
             return b"e"
         self.to(self.line.feasible, self.p, self.Hp)
+        # Π(x − alpha_bar * phi)
         self.set.project(self.x, 1 / self.B.tau, self.phi, self.x2)
         memcpy(self.x, self.x2, n * sizeof(double))
         self.gradient(self.x, self.g)
@@ -958,7 +959,7 @@ cdef class MPRGP:
         self.to(length, self.s, self.Hs)
         return b"f"
 
-    # 2. Sums of the stopping tests
+    # Step 5. Sums of the stopping tests
 
     cdef double cost(self, const double *x, const double *g) noexcept:
         """Return xᵀHx − 2bᵀx, twice the cost, computed from the gradient."""

@@ -72,8 +72,7 @@ cdef class SMALBE(MPRGP):
             self.set.add_discs(problem.discs, self.rows.x_tilde)
         if len(problem.diagonal):
             self.diagonal = read(problem.diagonal, self.owners)
-        self.alpha, self.Gamma_square = options.alpha, options.Gamma
-        self.Gamma_square *= self.Gamma_square
+        self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
         if options.expansion == "spectral":
             self.Gamma_square *= SPECTRAL_GAMMA
         self.expansion = SPECTRAL if options.expansion == "spectral" else MODEL
@@ -265,6 +264,7 @@ cdef class SMALBE(MPRGP):
         cdef double before = -INFINITY, lagrangian, error
         cdef long left = options.max_steps
         cdef bint stopped, enough, solved, stalled
+        # Step 0. Choose η, β, M, ρ and μ: `options` and `at`
         memcpy(self.x, address(at.nu), n * sizeof(double))
         memcpy(self.g, address(at.g), n * sizeof(double))
         if at.rho != self.rho or not at.outer:
@@ -288,7 +288,7 @@ cdef class SMALBE(MPRGP):
             left -= len(o.trace) + 1
         status = Status.ITERATION_LIMIT
         while True:
-            # 1. The inner problem.
+            # Step 1. The inner problem.
             trace, M = bytearray(), self.M_now
             memcpy(self.rhs, self.b, n * sizeof(double))
             self.rows.add(-1.0, mu, self.rhs)
@@ -297,14 +297,14 @@ cdef class SMALBE(MPRGP):
             stopped = self.minimise(max(left, 0), trace, note)
             left -= len(trace) + 1
             solved = stopped and self.solved
-            # 2. The Lagrangian, and the precision of the inner problems.
+            # The Lagrangian, which must grow by ρ/2·‖Cν‖².
             self.rows.times(self.x, self.Cv)
             error = self.rows.size(self.Cv)
             lagrangian = self.lagrangian(mu)
-            enough = lagrangian >= before + self.rho / 2 * error * error
+            enough = lagrangian >= before + 0.5 * self.rho * error * error
             before = lagrangian
             done.append((trace.decode(), M, self.rho, error, lagrangian))
-            # 3. Stop, or apply the safeguards that may end the loop.
+            # Stop, or apply the safeguards that may end the loop.
             if solved:
                 status = Status.SOLVED
                 break
@@ -315,10 +315,11 @@ cdef class SMALBE(MPRGP):
                 break
             if not stopped or left < 0:
                 break
-            # 4. The multipliers, the precision of the next inner run, and the penalty.
+            # Step 2. Update the multipliers, and the gradient with them.
             self.rows.add(self.rho, self.Cv, self.g)
             for i in range(r):
                 mu[i] += self.rho * self.Cv[i]
+            # Step 3. Update M, or ρ if ‖Cν‖ stalls.
             if not enough:
                 self.M_now *= options.beta
             if stalled and self.rows.are_met(self.x, self.Cv, tol, self.b_size):
@@ -327,6 +328,7 @@ cdef class SMALBE(MPRGP):
                 if self.rho >= MAX_RHO:
                     break
                 self.change_penalty(fmin(10 * self.rho, MAX_RHO))
+            # Step 4. k ← k + 1
         if self.factor is not None:
             self.counts["factorisations"] = self.factor.factorisations
             self.counts["preconditioner_applies"] = self.factor.solves
@@ -341,6 +343,7 @@ cdef class SMALBE(MPRGP):
         self.solved = size <= self.next_tested and self.is_solved(size)
         if self.solved or not self.rows.exist or size >= self.coarse_gradient:
             return self.solved
+        # ‖g^P‖ < min(M‖Cν‖, η‖b‖)
         return size < self.M_now * self.violation()
 
     cdef bint is_solved(self, double size) except -1:
