@@ -5,7 +5,10 @@ import pytest
 
 from mortarbench.harness import InputError
 from mortarbench.problems.contact import surface as contact
-from mortarbench.problems.contact.node_to_facet import node_to_facet
+from mortarbench.problems.contact.node_to_facet import (
+    geometric_stiffness,
+    node_to_facet,
+)
 from mortarbench.problems.contact.rows import rows_along
 from mortarbench.problems.contact.surface import divided, surface
 
@@ -125,6 +128,31 @@ def test_the_linearised_gap_is_exact_to_first_order():
         errors.append(abs(true_gap - (c - B @ du)).max())
 
     assert errors[1] < errors[0] / 50
+
+
+@pytest.mark.parametrize("fixed", [None, np.array([0, 2])])
+def test_the_geometric_stiffness_is_the_derivative_of_the_forces(fixed):
+    """Central differences of Bᵀλ, at nodes above the segments 1 and 2 (of 4)."""
+    rng = np.random.default_rng(4)
+    master = np.column_stack([[4.0, 2.5, 2, 1, 0], [0.0, 0.1, 0.1, -0.2, 0.0]])
+    points = np.concatenate([[[2.3, 0.3], [1.4, 0.2]], master])
+    u, force = 0.02 * rng.standard_normal(14), np.array([3.0, 2.0])
+    sides, step = (np.arange(2), np.arange(2, 7)), 1e-6
+
+    def forces(u):
+        B, *_ = node_to_facet(points, u, *sides, fixed_segments=fixed)
+        return B.T @ force
+
+    blocks, dofs = geometric_stiffness(points, u, *sides, force, fixed)
+    K = np.zeros((14, 14))
+    for block, at in zip(blocks, dofs, strict=True):
+        K[np.ix_(at, at)] += block
+    moved = (
+        (forces(u + step * e) - forces(u - step * e)) / (2 * step) for e in np.eye(14)
+    )
+
+    assert K == pytest.approx(K.T, abs=1e-12)
+    assert K == pytest.approx(np.array([*moved]), abs=1e-6 * np.abs(K).max())
 
 
 def test_a_node_exactly_on_a_vertex_has_no_gap_and_the_averaged_normal():
