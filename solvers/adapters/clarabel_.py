@@ -15,13 +15,12 @@ import numpy as np
 from scipy.sparse import triu
 
 from mortarbench.harness import (
-    NO_SOLUTION,
     QP,
     About,
     Solution,
     Status,
 )
-from mortarbench.solvers.common.adapter import SequenceAdapter
+from mortarbench.solvers.common.adapter import SequenceAdapter, concluded
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     csc,
@@ -30,12 +29,11 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = "PrimalInfeasible"  #: status with a certificate of infeasibility
 CLAIMS = {
     "Solved": Status.SOLVED,
     "MaxIterations": Status.ITERATION_LIMIT,
     "MaxTime": Status.TIME_LIMIT,
-    PRIMAL: Status.INFEASIBLE,
+    "PrimalInfeasible": Status.INFEASIBLE,
     "DualInfeasible": Status.UNBOUNDED,
 }  #: all other statuses (AlmostSolved, InsufficientProgress, …) count as FAILED
 
@@ -107,17 +105,13 @@ class Clarabel(SequenceAdapter):
 
         def solve() -> Solution:
             r = solver.solve()
-            status = CLAIMS.get(str(r.status), Status.FAILED)
-            if status in NO_SOLUTION:
-                is_primal = str(r.status) == PRIMAL
-                ray = form.multipliers(np.array(r.z)) if is_primal else {}
-                return Solution.without_point(qp, status, str(r.status), **ray)
-            return Solution(
-                status=status,
+            return concluded(
+                qp,
+                CLAIMS.get(str(r.status), Status.FAILED),
+                str(r.status),
+                form.multipliers(np.array(r.z) / scale),
                 x=np.array(r.x),
-                **form.multipliers(np.array(r.z) / scale),
                 iterations=r.iterations,
-                message=str(r.status),
                 reported={
                     "linear_solver": solver.get_info().linsolver.name,
                     "solve_seconds": r.solve_time,

@@ -21,23 +21,17 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session
 
+#: claim and message of each exit flag
 CLAIMS = {
-    1: Status.SOLVED,
-    2: Status.FAILED,  # solution of a problem with softened constraints
-    -1: Status.INFEASIBLE,
-    -3: Status.UNBOUNDED,
-    -4: Status.ITERATION_LIMIT,
-}  #: all other exit flags count as FAILED
-MESSAGES = {
-    1: "optimal",
-    2: "soft optimal",
-    -1: "infeasible",
-    -2: "cycling",
-    -3: "unbounded",
-    -4: "iteration limit",
-    -5: "nonconvex",
-    -6: "overdetermined initial working set",
-    -7: "time limit",
+    1: (Status.SOLVED, "optimal"),
+    2: (Status.FAILED, "soft optimal"),  # solves a QP with softened constraints
+    -1: (Status.INFEASIBLE, "infeasible"),
+    -2: (Status.FAILED, "cycling"),
+    -3: (Status.UNBOUNDED, "unbounded"),
+    -4: (Status.ITERATION_LIMIT, "iteration limit"),
+    -5: (Status.FAILED, "nonconvex"),
+    -6: (Status.FAILED, "overdetermined initial working set"),
+    -7: (Status.TIME_LIMIT, "time limit"),
 }
 INFINITE = 1e30  #: DAQP's value for an absent bound
 EQUALITY = 5  #: DAQP's flag for an equality
@@ -106,8 +100,7 @@ class DAQP(SequenceAdapter):
 
         def solve() -> Solution:
             x, _, flag, info = model.solve()
-            status = CLAIMS.get(flag, Status.FAILED)
-            message = MESSAGES.get(flag, f"exit flag {flag}")
+            status, message = CLAIMS.get(flag, (Status.FAILED, f"exit flag {flag}"))
             if status in NO_SOLUTION:
                 return Solution.without_point(qp, status, message)
             lam: Vector = np.array(info["lam"]) / scale

@@ -11,8 +11,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, needs_matrices
-from mortarbench.solvers.common.adapter import SequenceAdapter
+from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.adapter import SequenceAdapter, concluded
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_choice,
@@ -24,11 +24,10 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session
 
-PRIMAL = "PIQP_PRIMAL_INFEASIBLE"
 CLAIMS = {
     "PIQP_SOLVED": Status.SOLVED,
     "PIQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
-    PRIMAL: Status.INFEASIBLE,
+    "PIQP_PRIMAL_INFEASIBLE": Status.INFEASIBLE,
     "PIQP_DUAL_INFEASIBLE": Status.UNBOUNDED,
 }  #: all other statuses count as FAILED
 
@@ -94,19 +93,14 @@ class PIQP(SequenceAdapter):
         def solve() -> Solution:
             status = CLAIMS.get(solver.solve().name, Status.FAILED)
             r, info = solver.result, solver.result.info
-            multipliers = dict(
-                y=r.y / scale, z=r.z_u / scale, z_box=(r.z_bu - r.z_bl) / scale
-            )
-            if status in NO_SOLUTION:
-                # the diverging multipliers approach a certificate of infeasibility
-                ray = multipliers if info.status.name == PRIMAL else {}
-                return Solution.without_point(qp, status, info.status.name, **ray)
-            return Solution(
-                status=status,
+            # the diverging multipliers approach a certificate of infeasibility
+            return concluded(
+                qp,
+                status,
+                info.status.name,
+                dict(y=r.y / scale, z=r.z_u / scale, z_box=(r.z_bu - r.z_bl) / scale),
                 x=r.x,
-                **multipliers,
                 iterations=info.iter,
-                message=info.status.name,
                 counts={"factor_retries": info.factor_retires},
                 reported={
                     "linear_solver": s.kkt_solver.name,

@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mortarbench.harness import (
-    NO_SOLUTION,
     QP,
     About,
     Solution,
@@ -20,7 +19,7 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
-from mortarbench.solvers.common.adapter import SequenceAdapter
+from mortarbench.solvers.common.adapter import SequenceAdapter, concluded
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_choice,
@@ -35,11 +34,10 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session
 
-PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
     "PROXQP_SOLVED": Status.SOLVED,
     "PROXQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
-    PRIMAL: Status.INFEASIBLE,
+    "PROXQP_PRIMAL_INFEASIBLE": Status.INFEASIBLE,
     "PROXQP_DUAL_INFEASIBLE": Status.UNBOUNDED,
     "PROXQP_SOLVED_CLOSEST_PRIMAL_FEASIBLE": Status.INFEASIBLE,
 }  #: all other statuses count as FAILED
@@ -132,19 +130,13 @@ class ProxQP(SequenceAdapter):
             else:
                 solver.solve()
             r = solver.results
-            status = CLAIMS.get(r.info.status.name, Status.FAILED)
-            if status in NO_SOLUTION:
-                ray: dict[str, Vector] = {}
-                if r.info.status.name == PRIMAL:
-                    ray = dict(y=np.array(r.y), **form.multipliers(np.array(r.z)))
-                return Solution.without_point(qp, status, r.info.status.name, **ray)
-            return Solution(
-                status=status,
+            return concluded(
+                qp,
+                CLAIMS.get(r.info.status.name, Status.FAILED),
+                r.info.status.name,
+                dict(y=np.array(r.y), **form.multipliers(np.array(r.z))),
                 x=np.array(r.x),
-                y=np.array(r.y),
-                **form.multipliers(np.array(r.z)),
                 iterations=r.info.iter,
-                message=r.info.status.name,
                 counts={"iter_ext": r.info.iter_ext, "mu_updates": r.info.mu_updates},
                 reported={
                     "linear_solver": f"{backend} ldl, updated",

@@ -29,12 +29,11 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session
 
-PRIMAL = "PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
     "SOLVED": Status.SOLVED,
     "MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     "TIME_LIMIT_REACHED": Status.TIME_LIMIT,
-    PRIMAL: Status.INFEASIBLE,
+    "PRIMAL_INFEASIBLE": Status.INFEASIBLE,
     "DUAL_INFEASIBLE": Status.UNBOUNDED,
 }  #: all other statuses count as FAILED
 INFINITE = 1e20  #: QPALM's value for an absent bound
@@ -82,6 +81,7 @@ class QPALM(SequenceAdapter):
             settings, eps_abs=NEGLIGIBLE, eps_rel=tol, max_iter=self.max_iter, verbose=0
         )
         solver = qpalm.Solver(data, settings)
+        claims = {getattr(qpalm.Info, name): CLAIMS[name] for name in CLAIMS}
         starts: list[tuple[Vector, Vector]] = []
 
         def solve() -> Solution:
@@ -89,11 +89,10 @@ class QPALM(SequenceAdapter):
                 solver.warm_start(*starts.pop())
             solver.solve(asynchronous=False)
             info = solver.info
-            name = _name(qpalm, info.status_val)
-            status = CLAIMS.get(name, Status.FAILED)
+            status = claims.get(info.status_val, Status.FAILED)
             if status in NO_SOLUTION:
                 ray: dict[str, Vector] = {}
-                if name == PRIMAL:
+                if status is Status.INFEASIBLE:
                     ray = from_two_sided(qp, np.array(solver.prim_inf_certificate))
                 return Solution.without_point(qp, status, info.status, **ray)
             x, y = np.array(solver.solution.x), np.array(solver.solution.y)
@@ -129,9 +128,3 @@ class QPALM(SequenceAdapter):
 def _rows(qp: QP) -> tuple[object, Vector, Vector]:
     rows, low, high = two_sided(qp)
     return rows, np.maximum(low, -INFINITE), np.minimum(high, INFINITE)
-
-
-def _name(qpalm: object, status_val: int) -> str:
-    info = qpalm.Info  # type: ignore[attr-defined]
-    names = (*CLAIMS, "USER_CANCELLATION", "ERROR", "UNSOLVED")
-    return next((n for n in names if getattr(info, n) == status_val), "")

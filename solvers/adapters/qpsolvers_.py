@@ -9,12 +9,11 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.sparse import eye_array, vstack
 
 from mortarbench.harness import (
     NO_SOLUTION,
@@ -46,11 +45,6 @@ DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadpro
 #: itself, with a wrong result
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
 NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
-#: backends that receive equal bounds as equality rows; with equal bounds, quadprog
-#: claims for one of eight feasible QPs (conformance, shape 'fixed') that no point is
-#: feasible
-NEEDS_FIXED_IN_ROWS = ("quadprog",)
-
 #: claim for a status message without a solution; the first pattern that matches counts
 STATUS_PATTERNS = (
     (r"max(imum)?_?\W*iter", Status.ITERATION_LIMIT),
@@ -87,7 +81,9 @@ class QPSolvers(BackendAdapter):
             "convex QPs are unbounded (conformance, shape 'unconstrained').",
             "qpsolvers reports no iterations for clarabel, cvxopt, daqp, highs, "
             "quadprog and sip.",
-            "quadprog has no tolerance and solves strictly convex QPs only.",
+            "quadprog has no tolerance and solves strictly convex QPs only. QPs with "
+            "equal bounds are declined, because it claims for one of eight of them "
+            "(conformance, shape 'fixed') that no point is feasible.",
             "The backend ecos attains only half of the requested digits. pyqpmad, "
             "which `make setup` does not install, returns wrong multipliers for fixed "
             "variables.",
@@ -107,8 +103,8 @@ class QPSolvers(BackendAdapter):
             return "needs a row or a bound; qpsolvers solves unconstrained QPs itself"
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
-        if self.backend in NEEDS_FIXED_IN_ROWS:
-            qp, _ = _fixed_in_rows(qp)
+        if self.backend == "quadprog" and (qp.lb == qp.ub).any():
+            return "takes feasible QPs with equal bounds for infeasible"
         needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS
         if needs_rank and (reason := _needs_independent_rows(qp)):
             return reason
@@ -116,13 +112,6 @@ class QPSolvers(BackendAdapter):
         return needs_dense(qp, 4) if dense_only else needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        if self.backend not in NEEDS_FIXED_IN_ROWS:
-            return self._prepare(qp, tol)
-        other, back = _fixed_in_rows(qp)
-        solve = self._prepare(other, tol)
-        return lambda: back(solve())
-
-    def _prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import qpsolvers
 
         call = call_of(self.backend)
@@ -225,22 +214,3 @@ def _needs_independent_rows(qp: QP) -> str | None:
     if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
         return None
     return "the equality rows are linearly dependent"
-
-
-def _fixed_in_rows(qp: QP) -> tuple[QP, Callable[[Solution], Solution]]:
-    """Replace equal bounds by equality rows.
-
-    Returns the new QP, and a function that converts its solutions to solutions of `qp`.
-    """
-    fixed, m = np.flatnonzero(qp.lb == qp.ub), qp.b.size
-    lb, ub = qp.lb.copy(), qp.ub.copy()
-    lb[fixed], ub[fixed] = -np.inf, np.inf
-    rows = eye_array(qp.q.size, format="csr")[fixed]
-    A, b = vstack([csc(qp.A), rows], format="csr"), np.append(qp.b, qp.lb[fixed])
-
-    def back(s: Solution) -> Solution:
-        z_box = s.z_box.copy()
-        z_box[fixed] = s.y[m:]
-        return replace(s, y=s.y[:m], z_box=z_box)
-
-    return replace(qp, A=A, b=b).with_bounds(lb, ub), back

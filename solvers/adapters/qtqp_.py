@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mortarbench.harness import (
-    NO_SOLUTION,
     QP,
     About,
     Solution,
@@ -20,7 +19,7 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
-from mortarbench.solvers.common.adapter import SequenceAdapter
+from mortarbench.solvers.common.adapter import SequenceAdapter, concluded
 from mortarbench.solvers.common.conversion import (
     check_choice,
     csc,
@@ -29,11 +28,10 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session
 
-PRIMAL = "infeasible"  #: status with a certificate of infeasibility
 CLAIMS = {
     "solved": Status.SOLVED,
     "hit_max_iter": Status.ITERATION_LIMIT,
-    PRIMAL: Status.INFEASIBLE,
+    "infeasible": Status.INFEASIBLE,
     "unbounded": Status.UNBOUNDED,
 }  #: all other statuses (almost_solved, …) count as FAILED
 LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
@@ -118,16 +116,13 @@ class QTQP(SequenceAdapter):
                 ),
             )
             message = r.status.value
-            status = CLAIMS.get(message, Status.FAILED)
-            if status in NO_SOLUTION:
-                ray = form.multipliers(np.array(r.y)) if message == PRIMAL else {}
-                return Solution.without_point(qp, status, message, **ray)
-            return Solution(
-                status=status,
+            return concluded(
+                qp,
+                CLAIMS.get(message, Status.FAILED),
+                message,
+                form.multipliers(np.array(r.y) / scale),
                 x=np.array(r.x),
-                **form.multipliers(np.array(r.y) / scale),
                 iterations=len(r.stats) - 1,
-                message=message,
                 counts={"accepted_starts": int(solver.warm_accepted)} if start else {},
                 reported={"linear_solver": self.linear_solver},
             )

@@ -13,8 +13,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.sparse import triu
 
-from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, needs_matrices
-from mortarbench.solvers.common.adapter import SequenceAdapter
+from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.adapter import SequenceAdapter, concluded
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     NEGLIGIBLE,
@@ -24,12 +24,11 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session
 
-PRIMAL = -2  #: status with a certificate of infeasibility
 CLAIMS = {
     1: Status.SOLVED,
     2: Status.ITERATION_LIMIT,  # inaccurate solution at the iteration limit
     -1: Status.UNBOUNDED,
-    PRIMAL: Status.INFEASIBLE,
+    -2: Status.INFEASIBLE,
 }  #: all other statuses count as FAILED
 CERTIFICATE = 1e-9  #: tolerance of a certificate of infeasibility
 
@@ -100,17 +99,13 @@ class SCS(SequenceAdapter):
             x, y, s = form.point(point) if point else (None, None, None)
             r = solver.solve(warm_start=True, x=x, y=y, s=s)
             info = r["info"]
-            status = CLAIMS.get(info["status_val"], Status.FAILED)
-            if status in NO_SOLUTION:
-                is_primal = info["status_val"] == PRIMAL
-                ray = form.multipliers(r["y"]) if is_primal else {}
-                return Solution.without_point(qp, status, info["status"], **ray)
-            return Solution(
-                status=status,
+            return concluded(
+                qp,
+                CLAIMS.get(info["status_val"], Status.FAILED),
+                info["status"],
+                form.multipliers(r["y"]),
                 x=r["x"],
-                **form.multipliers(r["y"]),
                 iterations=info["iter"],
-                message=info["status"],
                 counts={
                     "scale_updates": info["scale_updates"],
                     "accelerated_steps": info["accepted_accel_steps"],

@@ -8,7 +8,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from mortarbench.harness import QP, Solution, needs_matrices
+from mortarbench.harness import (
+    NO_SOLUTION,
+    QP,
+    Solution,
+    Status,
+    Vector,
+    needs_matrices,
+)
 from mortarbench.solvers.common.conversion import check_positive
 from mortarbench.solvers.common.sequence import Session, chain
 
@@ -103,3 +110,18 @@ class SequenceAdapter(Adapter, ABC):
 
     @abstractmethod
     def _begin(self, qp: QP, tol: float) -> Session: ...
+
+
+def concluded(
+    qp: QP, status: Status, message: str, multipliers: dict[str, Vector], **point: Any
+) -> Solution:
+    """Return a solution; of a claim that there is none, only a certificate is kept.
+
+    The multipliers of an infeasible QP certify its infeasibility in any scaling.
+
+    point : x and further fields of the solution
+    """
+    if status in NO_SOLUTION:
+        ray = multipliers if status is Status.INFEASIBLE else {}
+        return Solution.without_point(qp, status, message, **ray)
+    return Solution(status=status, message=message, **multipliers, **point)
