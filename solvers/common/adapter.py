@@ -13,7 +13,6 @@ from mortarbench.harness import (
     QP,
     Solution,
     Status,
-    Vector,
     needs_matrices,
 )
 from mortarbench.solvers.common.conversion import check_positive
@@ -113,11 +112,11 @@ class SequenceAdapter(Adapter, ABC):
 
 
 def concluded(
-    qp: QP, status: Status, message: str, multipliers: dict[str, Vector], **point: Any
+    qp: QP, status: Status, message: str, multipliers: dict[str, Any], **point: Any
 ) -> Solution:
     """Return a solution; of a claim that there is none, only a certificate is kept.
 
-    The multipliers of an infeasible QP certify its infeasibility in any scaling.
+    Multipliers that are a certificate of infeasibility remain one in any scaling.
 
     point : x and further fields of the solution
     """

@@ -16,6 +16,7 @@ from mortarbench.harness.verify.verdicts import (
     certified,
     evaluated,
     judged,
+    judgement,
     new_record,
     quantities_of,
 )
@@ -87,6 +88,14 @@ def test_a_solution_is_verified_and_has_its_objective():
 
     assert got.status is Verdict.VERIFIED
     assert got.objective == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
+
+
+@pytest.mark.parametrize(
+    ("y", "note"),
+    [(0.25, ""), (-0.25, "with −y all residuals vanish: check the sign of y")],
+)
+def test_only_a_refuted_claim_has_a_note_on_its_reason(y, note):
+    assert judgement(QP_, replace(POINT, y=np.array([y])), 1e-8)[1] == note
 
 
 @pytest.mark.parametrize(
