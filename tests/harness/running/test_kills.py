@@ -35,7 +35,7 @@ params = {{ h = [0.5, 1.0, 1.5] }}
 RUNS = f"""
 import sys
 from pathlib import Path
-from harness import InputError
+from mortarbench.harness import InputError
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.progress import display_on
 from mortarbench.harness.registry import load_plugin, resolve
