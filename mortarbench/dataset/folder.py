@@ -139,7 +139,8 @@ def info() -> dict[str, Any]:
         "core": len(core),
         "problems": len(single),
         "families": dict(Counter(row["family"] for row in core)),
-        "sequences": dict(Counter(r["sequence"] for r in rows if r["sequence"])),
+        "sequences": dict(Counter(r["family"] for r in rows if r["step"] == "1")),
+        "steps": len(rows) - len(single),
         "kinds": dict(Counter(row["kind"] for row in single)),
         "variables": f"{sizes[0]} to {sizes[-1]}, median {sizes[len(sizes) // 2]}",
         "classes": {name: sum(r[name] == "yes" for r in rows) for name in classes},
@@ -154,9 +155,7 @@ def store_problem(row: Row) -> str:
 
 def _published(row: Row) -> QP:
     """Return the QP of an item, with the stored bits."""
-    start = f"{row['name']}/"
-    own = {k.removeprefix(start): v for k, v in _bits().items() if k.startswith(start)}
-    return standard_qp(row, own)
+    return standard_qp(row, _bits()[row["name"]])
 
 
 def _saved(row: Row, qp: QP, path: Path) -> str:

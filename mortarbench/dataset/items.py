@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csc_array, diags_array
 
 from mortarbench.case import Case, as_case
@@ -38,7 +39,8 @@ Certificate = Mapping[str, Vector]
 
 HERE = Path(__file__).parent
 CATALOGUE = "catalogue.csv"
-BITS = "bits.npz"  #: last bits of arrays, by the name of the item and the array
+BITS = "bits.npz"  #: last bits of numbers, see `last_bits`, by the name of the item
+NO_BITS = np.zeros(0, dtype=np.uint8)
 COLUMNS = (
     "name", "path", "digest", "core", "family", "sequence", "step", "kind",
     "dense", "strictly_convex", "discs", "n", "equalities", "inequalities", "bounds",
@@ -130,14 +132,18 @@ def _solved(qp: QP) -> Any:
     return Registries().reference(qp)
 
 
-def standard_qp(row: Row, bits: Mapping[str, Any]) -> QP:
+def scaled_qp(row: Row) -> QP:
+    """Return the QP of an item, scaled but not rounded."""
+    scales = Scales(*map(int, row["scales"].split()))
+    return scaled(original(row["case"], row["change"]), scales)
+
+
+def standard_qp(row: Row, bits: NDArray[np.uint8] = NO_BITS) -> QP:
     """Return the QP of an item, scaled and rounded.
 
-    bits : stored bits of the arrays of this item that depend on BLAS, by their names
+    bits : stored bits of this item, see `last_bits`
     """
-    scales = Scales(*map(int, row["scales"].split()))
-    qp = scaled(original(row["case"], row["change"]), scales)
-    qp = rounded(qp, bits, is_shifted=row["shifted"] == "yes")
+    qp = rounded(scaled_qp(row), bits, is_shifted=row["shifted"] == "yes")
     if row["kind"] == UNBOUNDED:  # rounding must not bend P along the translation
         return replace(qp, P=csc_array(qp.P - diags_array(qp.P.sum(axis=1))))
     return qp

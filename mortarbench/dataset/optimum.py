@@ -21,6 +21,7 @@ interval. Norms and singular values are evaluated in double precision.
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf, nextafter
 from typing import Any
 
 import numpy as np
@@ -63,7 +64,7 @@ def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> tuple[float, fl
         raise UnprovenError("cones are not supported")
     size, z = np.abs(x), np.maximum(z, 0)
     P, A, G = (M.astype(Real) for M in (qp.P, qp.A, qp.G))
-    Px, roundings = P @ x.astype(Real), _EPS * (x.size + y.size + z.size + 10)
+    Px, roundings = P @ x.astype(Real), 2 * _EPS * (x.size + y.size + z.size)
     objective = 0.5 * (x @ Px) + qp.q.astype(Real) @ x
     error = roundings * (0.5 * (size @ (abs(P) @ size)) + np.abs(qp.q) @ size)
     delta = _distance(qp, x)
@@ -73,11 +74,12 @@ def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> tuple[float, fl
     force = Px + qp.q + A.T @ y.astype(Real) + G.T @ z.astype(Real)
     sizes = abs(P) @ size + np.abs(qp.q) + abs(A).T @ np.abs(y) + abs(G).T @ z
     borne = admissible(qp.sets, -force.astype(float))
-    support = sum(one.support(borne) for one in qp.sets)
+    support = sum(one.support(borne.astype(Real)) for one in qp.sets)
+    reach = np.abs(np.nan_to_num(hull(qp.sets, x.size), posinf=0, neginf=0)).max(axis=0)
     r = force + borne
     low = r @ x - 0.5 * (x @ Px) - qp.b.astype(Real) @ y - qp.h.astype(Real) @ z
     error += roundings * (np.abs(qp.b) @ np.abs(y) + np.abs(qp.h) @ z + sizes @ size)
-    error += 4 * np.finfo(float).eps * abs(support)
+    error += roundings * (np.abs(borne) @ reach) + np.finfo(float).eps * abs(support)
     r = np.abs(r) + roundings * sizes
     curved = np.isfinite(e := curvature_exponents(qp.P))
     if curved.any():
@@ -85,7 +87,7 @@ def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> tuple[float, fl
             raise UnprovenError("P is not provably positive semidefinite")
         error += ((r[curved] / np.exp2(e[curved])) ** 2).sum() / (2 * curvature)
     low -= support + error + RADIUS * r[~curved].sum()
-    return float(low), float(high)
+    return nextafter(float(low), -inf), nextafter(float(high), inf)
 
 
 def least_curvature(P: Any) -> float:

@@ -6,7 +6,7 @@ farthest points (Gonzalez 1985) in standardised features, most of them logarithm
 next problem is the one whose nearest chosen problem is the farthest away.
 
 The command writes the catalogue and, in ``bits.npz``, the last bits of arrays that
-depend on BLAS. Items that still differ between two kernels of OpenBLAS are left out.
+depend on BLAS. Items that still differ between kernels of OpenBLAS are left out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array
@@ -40,6 +39,7 @@ from mortarbench.dataset.items import (
     iterations,
     objections,
     original,
+    scaled_qp,
     standard_qp,
     write_catalogue,
 )
@@ -52,8 +52,6 @@ from mortarbench.dataset.standard import (
     Scales,
     curvature_exponents,
     last_bits,
-    numbers,
-    scaled,
     scales_of,
 )
 from mortarbench.harness import QP, InputError
@@ -81,7 +79,8 @@ COULOMB_CASES = (
     "hertz-cylinder/n=10/m=8/friction=coulomb/mu=0.3/Q=0.5/dual",
 )
 CAP = 4  #: largest number of problems of a family in the core
-KERNELS = ("Haswell", "Prescott")  #: two kernels of OpenBLAS, for any x86-64 processor
+#: Kernels of OpenBLAS. The last needs a processor with AVX-512.
+KERNELS = ("Haswell", "Prescott", "SkylakeX")
 #: Eigenvalues of the scaled P below this fraction of the largest count as zero.
 ZERO = 1e-8
 #: Largest n for which all eigenvalues are computed, and their number for larger n.
@@ -97,12 +96,14 @@ def main() -> None:
         rows = json.load(sys.stdin)
         return print(json.dumps({row["name"]: store_problem(row) for row in rows}))
     rows = sorted(described(), key=lambda row: row["path"])
-    write_arrays(HERE / BITS, dict(bit for row in rows for bit in _bits(row)))
-    one, other = (digests_under(kernel, rows) for kernel in KERNELS)
-    rows = [row for row in rows if one[row["name"]] == other[row["name"]]]
+    with one_thread():
+        bits = {row["name"]: last_bits(scaled_qp(row)) for row in rows}
+    write_arrays(HERE / BITS, bits)
+    digests = [digests_under(kernel, rows) for kernel in KERNELS]
+    rows = [row for row in rows if len({d[row["name"]] for d in digests}) == 1]
     choose_core(rows)
     for row in rows:
-        row["digest"] = one[row["name"]]
+        row["digest"] = digests[0][row["name"]]
     write_catalogue(HERE, rows)
     return None
 
@@ -180,9 +181,9 @@ def _described(row: Row) -> Row:
     if row["sequence"]:
         scales = _SCALES.setdefault(row["sequence"], scales)
     row |= {"scales": " ".join(map(str, scales)), "shifted": "no"}
-    if row["kind"] != UNBOUNDED and not least_curvature(standard_qp(row, {}).P):
+    if row["kind"] != UNBOUNDED and not least_curvature(standard_qp(row).P):
         row["shifted"] = "yes"
-    final = standard_qp(row, {})
+    final = standard_qp(row)
     proof = certificate(row["kind"], final)
     row |= {"optimum": "", "bound": ""}
     if row["kind"] == OPTIMAL:
@@ -196,12 +197,16 @@ def _described(row: Row) -> Row:
 
 
 def _optimum(qp: QP, proof: Certificate) -> Row:
-    """Return the optimum, and a bound of its error of at least 1e-10 max(1, |f*|)."""
+    """Return the optimum, and a bound of its error.
+
+    The bound is at least ten times the error, because other certificates, computed with
+    another kernel of BLAS, prove the optimum to a different accuracy.
+    """
     low, high = optimum_interval(qp, proof["x"], proof["y"], proof["z"])
     optimum = float(f"{(low + high) / 2:.12g}")
     size = max(1.0, abs(optimum))
     error = 2 * max(high - optimum, optimum - low) + 1e-12 * size
-    bound = max(10 ** np.ceil(np.log10(error / size)), 1e-10) * size
+    bound = max(10 ** np.ceil(1 + np.log10(error / size)), 1e-9) * size
     return {"optimum": repr(optimum), "bound": repr(float(bound))}
 
 
@@ -287,16 +292,6 @@ def choose_core(rows: Sequence[Row]) -> None:
             single[i]["core"] = "yes"
             distance = np.linalg.norm(points[members] - points[i], axis=1)
             far = np.minimum(far, distance) if number else distance
-
-
-def _bits(row: Row) -> Iterator[tuple[str, Any]]:
-    """Yield the stored bits of an item: those of all arrays, except of a sparse P."""
-    with one_thread():
-        scales = Scales(*map(int, row["scales"].split()))
-        qp = scaled(original(row["case"], row["change"]), scales)
-    for name, (vector, unit) in numbers(qp).items():
-        if name != "P" or row["dense"] == "yes":
-            yield f"{row['name']}/{name}", last_bits(vector, unit)
 
 
 def digests_under(kernel: str, rows: Sequence[Row]) -> dict[str, str]:

@@ -95,17 +95,18 @@ def numbers(qp: QP) -> dict[str, tuple[Vector, Any]]:
     )
 
 
-def rounded(qp: QP, bits: Mapping[str, Integers], *, is_shifted: bool) -> QP:
+def rounded(qp: QP, bits: NDArray[np.uint8], *, is_shifted: bool) -> QP:
     """Return the QP with integer multiples of units, and a shift of P if `is_shifted`.
 
-    bits : the last eight bits of the integers, of arrays that depend on BLAS
+    bits : result of `last_bits`, or empty to use the integers that are nearest
     """
-    values = {}
+    values, half, start = dict[str, Vector](), _KEPT // 2, 0
     for name, (vector, unit) in numbers(qp).items():
         k = _integers(vector, unit)
-        if name in bits:
-            half = _KEPT // 2
-            k += (bits[name].astype(np.int64) - k + half) % _KEPT - half
+        if bits.size and _depends_on_blas(qp, name):
+            last = bits[start : start + k.size].astype(np.int64)
+            start += k.size
+            k += (last - k + half) % _KEPT - half
         values[name] = np.where(np.isfinite(vector), k * unit, vector)
     P, e = _triangle(qp.P), curvature_exponents(qp.P)
     lower = coo_array((values["P"], P.coords), shape=P.shape)
@@ -123,9 +124,19 @@ def rounded(qp: QP, bits: Mapping[str, Integers], *, is_shifted: bool) -> QP:
     return QP(**parts, sets=sets)
 
 
-def last_bits(vector: Vector, unit: Any) -> NDArray[np.uint8]:
-    """Return the last eight bits of the integers of numbers with a unit."""
-    return np.asarray(_integers(vector, unit) % _KEPT, dtype=np.uint8)
+def last_bits(qp: QP) -> NDArray[np.uint8]:
+    """Return the last eight bits of the integers of arrays that depend on BLAS."""
+    parts = [
+        _integers(vector, unit) % _KEPT
+        for name, (vector, unit) in numbers(qp).items()
+        if _depends_on_blas(qp, name)
+    ]
+    return np.concatenate(parts).astype(np.uint8)
+
+
+def _depends_on_blas(qp: QP, name: str) -> bool:
+    """Return False for a stiffness matrix, which is assembled without BLAS."""
+    return name != "P" or not issparse(qp.P)
 
 
 def curvature_exponents(P: Any) -> Vector:

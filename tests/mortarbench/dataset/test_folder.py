@@ -195,6 +195,26 @@ def test_the_whole_core_has_the_same_bytes_under_another_kernel(kernel):
     rebuilt_under(kernel, [r["name"] for r in catalogue() if r["core"] == "yes"])
 
 
+def test_the_published_set_has_what_it_promises():
+    rows = catalogue()
+    core = [row for row in rows if row["core"] == "yes"]
+    assert 50 <= len(core) <= 70
+    assert len({row["name"] for row in rows}) == len(rows)
+    for row in rows:
+        if row["kind"] == "optimal":
+            assert float(row["bound"]) <= 1e-8 * max(1, abs(float(row["optimum"])))
+    steps = {}
+    for row in rows:
+        if row["sequence"]:
+            steps.setdefault(row["sequence"], []).append(int(row["step"]))
+    assert len(steps) >= 20
+    for numbers in steps.values():
+        assert numbers == [*range(1, len(numbers) + 1)]
+        assert len(numbers) >= 3
+    assert {row["kind"] for row in core} == {"optimal", "infeasible", "unbounded"}
+    assert (folders.HERE / "bits.npz").stat().st_size <= 5e6
+
+
 def test_bad_folders_are_refused_in_one_line(tmp_path, capsys):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("")

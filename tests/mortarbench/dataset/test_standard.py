@@ -5,6 +5,7 @@ import pytest
 from scipy.sparse import csc_array, random_array
 
 from mortarbench import QP, Discs
+from mortarbench.dataset.items import NO_BITS
 from mortarbench.dataset.selection import CAP, choose_core
 from mortarbench.dataset.standard import (
     SHIFT,
@@ -55,8 +56,8 @@ def test_scaled_data_are_of_order_one():
 @pytest.mark.parametrize("dense", [True, False])
 def test_rounding_is_small_idempotent_and_symmetric(dense):
     qp = random_qp(3, dense=dense)
-    once = rounded(qp, {}, is_shifted=False)
-    twice = rounded(once, {}, is_shifted=False)
+    once = rounded(qp, NO_BITS, is_shifted=False)
+    twice = rounded(once, NO_BITS, is_shifted=False)
     for name, (vector, unit) in numbers(qp).items():
         new = numbers(once)[name][0]
         finite = np.isfinite(vector)
@@ -69,8 +70,7 @@ def test_rounding_is_small_idempotent_and_symmetric(dense):
 def test_the_stored_bits_undo_errors_of_a_hundred_units():
     rng = np.random.default_rng(4)
     qp = random_qp(4, dense=True)
-    names = ("P", "q", "ub", "disc_radius")
-    bits = {name: last_bits(*numbers(qp)[name]) for name in names}
+    bits = last_bits(qp)
     noise = 1 + 5e-11 * rng.uniform(-1, 1, (9, 9))
     noisy = QP(
         P=qp.P * (noise + noise.T) / 2,
@@ -87,7 +87,7 @@ def test_the_stored_bits_undo_errors_of_a_hundred_units():
 
 def test_the_shift_is_a_small_part_of_the_diagonal():
     qp = random_qp(5, dense=False)
-    plain, shifted = (rounded(qp, {}, is_shifted=flag) for flag in (False, True))
+    plain, shifted = (rounded(qp, NO_BITS, is_shifted=flag) for flag in (False, True))
     added = (shifted.P - plain.P).toarray()
     assert np.array_equal(added, np.diag(added.diagonal()))
     ratio = added.diagonal() / (SHIFT * plain.P.diagonal())
