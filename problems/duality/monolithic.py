@@ -142,7 +142,8 @@ def load_path(
         iteration for Coulomb's law
 
     """
-    # K⁺f of the full load is stored, because stages may share their load and supports
+    # displacements without contact are stored, because stages may share their load and
+    # supports
     bodies_by_stage = dict[tuple[int, int], Bodies]()
     inverses = dict[int, GeneralisedInverse]()
     free = dict[tuple[int, int], Vector]()
@@ -170,7 +171,8 @@ def load_path(
         @cache
         def dual() -> Transformed:
             if load not in free:
-                free[load] = _unconstrained(loaded, inverse(stage))
+                lift = np.zeros_like(loaded.f) if loaded.lift is None else loaded.lift
+                free[load] = lift + inverse(stage)(loaded.f - loaded.K @ lift)
             return transform(primal, inverse(stage), free[load] * stage.part, first)
 
         return MonolithicLinearisation(
@@ -179,13 +181,6 @@ def load_path(
 
     zero, places = np.zeros(bodies.mesh.dofs), slave_places(bodies.pairs)
     return LoadPath(stages, pose, State(zero, zero, np.full(places, initial_force)))
-
-
-def _unconstrained(bodies: Bodies, inverse: GeneralisedInverse) -> Vector:
-    """Return the displacement (n,) under the full load without contact."""
-    if bodies.lift is None:
-        return inverse(bodies.f)
-    return bodies.lift + inverse(bodies.f - bodies.K @ bodies.lift)
 
 
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:

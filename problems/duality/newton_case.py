@@ -54,7 +54,11 @@ def newton_path(
     gaps = Gaps(linearise)
     if contact == "nts":
         gaps = _node_to_segment(bodies, linearise, stiffness)
-    cells = cells_without_units(bodies, material)
+    # nondimensional with the units l and F₀ of K
+    l, F = bodies.length, bodies.force
+    mesh = replace(bodies.mesh, points=bodies.mesh.points / l)
+    laws = [hyperelastic(material, m, unit=F / l) for m in bodies.materials]
+    cells = cells_of(mesh, laws, bodies.body)
     return NewtonPath(bodies, cells, gaps, reference, steps)
 
 
@@ -75,14 +79,6 @@ def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Ga
     return Gaps(
         linearise, contact_stiffness(bodies) if geometric else None, keep_segments
     )
-
-
-def cells_without_units(bodies: Bodies, material: str) -> Cells:
-    """Return the cells of bodies, nondimensional with the units l and F₀ of K."""
-    l, F = bodies.length, bodies.force
-    mesh = replace(bodies.mesh, points=bodies.mesh.points / l)
-    laws = [hyperelastic(material, m, unit=F / l) for m in bodies.materials]
-    return cells_of(mesh, laws, bodies.body)
 
 
 def newton_case(

@@ -75,7 +75,15 @@ class Choice(NamedTuple):
 
 
 def keyed_linearisation(
-    contact: str, basis: str
+    contact: str, basis: str, *, undeformed: bool = False
 ) -> Callable[[UnassembledBodies, Sequence[FrictionLaw]], Linearise]:
-    """Return the linearisation that the keys `contact` and `basis` select."""
-    return lambda bodies, laws: linearisation(bodies, contact, basis, laws)
+    """Return the linearisation that the keys `contact` and `basis` select.
+
+    undeformed : linearise at the undeformed state, whatever the displacement
+    """
+
+    def linearise(bodies: UnassembledBodies, laws: Sequence[FrictionLaw]) -> Linearise:
+        rows = linearisation(bodies, contact, basis, laws)
+        return (lambda u: rows(np.zeros_like(u))) if undeformed else rows
+
+    return linearise

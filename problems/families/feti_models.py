@@ -538,31 +538,43 @@ class Membranes(DecomposedFamily):
         nodes, sides = len(mesh.points), mesh.boundaries
         K = grid_stiffness((self.side, self.side))
         one = csr_array(eye_array(nodes, format="csr"))
-        A, G = one[np.sort(sides["left left"])], _contact_rows(sides, nodes)
+        A, G = one[np.sort(sides["left left"])], self.contact_rows
         return QP(
             P=csc_array(block_diag([K, K], format="csc")),
-            q=-self.load(np.arange(nodes)),
+            q=-self.load,
             A=A,
             b=np.zeros(A.shape[0]),
             G=G,
             h=np.zeros(G.shape[0]),
         )
 
-    def load(self, node: Nodes) -> Vector:
-        """Return the nodal forces (k,) on the nodes `node` (k,)."""
-        body, within = np.divmod(node, (self.side + 1) ** 2)
-        row, column = np.divmod(within, self.side + 1)
-        f = np.array([value for value, _ in MEMBRANE_LOADS])
-        heights = np.stack([hat_integrals(self.side, *y) for _, y in MEMBRANE_LOADS])
+    @property
+    def load(self) -> Vector:
+        """Nodal forces, (nodes,); x varies fastest in the numbers of nodes."""
         along = hat_integrals(self.side, 0.0, 1.0)
-        return np.asarray(f[body] * (heights[body, row] * along[column]))
+        parts = [
+            value * np.outer(hat_integrals(self.side, *y), along).ravel()
+            for value, y in MEMBRANE_LOADS
+        ]
+        return np.concatenate(parts)
+
+    @property
+    def contact_rows(self) -> csr_array:
+        """Rows  u_1 − u_2 ≤ 0  of opposite nodes, (m, nodes)."""
+        mesh = self.joined[0]
+        one = csr_array(eye_array(len(mesh.points), format="csr"))
+        # sorted node numbers ascend with y on both sides, and the grids match
+        left, right = (
+            np.sort(mesh.boundaries[side]) for side in ("left right", "right left")
+        )
+        return csr_array(one[left] - one[right])
 
     def in_subdomains(self) -> DecomposedProblem:
         """Return the decomposed problem of both membranes."""
         mesh, body = self.joined
         label = joined_labels([blocks((self.side,) * 2, self.n)] * 2)
         layout, sides = Subdivision(mesh, label, body), mesh.boundaries
-        G = _contact_rows(sides, layout.nodes)
+        G = self.contact_rows
         return DecomposedProblem(
             layout=layout,
             components=1,
@@ -570,7 +582,7 @@ class Membranes(DecomposedFamily):
             assemble_class=membrane_class,
             E=np.ones(2),
             names=MEMBRANES,
-            load=self.load(np.arange(layout.nodes)),
+            load=self.load,
             glue=self.glue,
             fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
@@ -626,15 +638,6 @@ def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
         boundary=np.flatnonzero(((at == 0) | (at == last)).any(axis=0)),
         stiffness=np.ones(nodes),
     )
-
-
-def _contact_rows(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
-    """Return the rows  u_1 − u_2 ≤ 0  of opposite nodes, (m, nodes)."""
-    # sorted node numbers ascend with y on both sides, and the grids match
-    pairs = np.stack([np.sort(sides[s]) for s in ("left right", "right left")], axis=1)
-    ends = 2 * np.arange(len(pairs) + 1)
-    data = np.tile([1.0, -1.0], len(pairs))
-    return csr_array((data, pairs.ravel(), ends), shape=(len(pairs), nodes))
 
 
 def hat_integrals(n: int, lower: float, upper: float) -> Vector:

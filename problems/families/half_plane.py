@@ -53,6 +53,10 @@ from mortarbench.harness import (
 from mortarbench.harness.keys import DERIVED, Range
 from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
+from mortarbench.problems.families.half_space.cases import (
+    relative_distance,
+    surface_fields,
+)
 from mortarbench.problems.families.hertz import (
     CURVE_POINTS,
     MATERIAL,
@@ -175,7 +179,7 @@ def _hertz_case(n: int) -> Case:
             "approach_error": float(-s.y[0] / approach - 1),
             "p_max": float(p.max()),
             "p_max_error": float(p.max() / hertz.max() - 1),
-            "pressure_l2_error": _distance(p, hertz),
+            "pressure_l2_error": relative_distance(p, hertz),
             "half_width": float(half_width),
             "half_width_error": float(half_width / EXACT.a - 1),
         }
@@ -186,7 +190,7 @@ def _hertz_case(n: int) -> Case:
     def fields(s: Solution) -> Fields:
         p = s.x * EXACT.P / width
         gap = -s.z_box * _length_unit(EXACT.P)
-        return _surface(
+        return surface_fields(
             x,
             ContactSide(
                 name=SIDE,
@@ -245,7 +249,7 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
             "force_error": float((s.x.sum() - exact.Q) / exact.peak),
             "shear_centre": centre,
             "shear_centre_error": centre / at_centre - 1,
-            "shear_l2_error": _distance(q, mindlin),
+            "shear_l2_error": relative_distance(q, mindlin),
             "stick_half_width": c,
             "stick_half_width_error": c / exact.c - 1,
         }
@@ -258,7 +262,7 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
 
     def fields(s: Solution) -> Fields:
         p, q = bound * EXACT.P / width, s.x * F0 / width
-        return _surface(
+        return surface_fields(
             x,
             ContactSide(
                 name=SIDE,
@@ -325,23 +329,6 @@ def _case(
     )
 
 
-def _surface(x: Vector, side: ContactSide) -> Fields:
-    """Return tractions at the midpoints x (n,), m, as fields without a mesh.
-
-    The tractions act on the upper surface, which Q pushes along +x.
-    """
-    n = x.size
-    return Fields(
-        points=np.column_stack([x, np.zeros(n)]),
-        displacement=np.zeros((n, 2)),
-        cells=np.zeros((0, 4), dtype=np.int64),
-        bodies=np.zeros(0, dtype=np.int64),
-        contact_nodes=side.nodes,
-        contact_forces=side.force,
-        contacts=(side,),
-    )
-
-
 def _length_unit(force: float) -> float:
     """Return l = 2F₀/(πE*), m."""
     return 2 * force / (np.pi * EXACT.E_star)
@@ -349,8 +336,3 @@ def _length_unit(force: float) -> float:
 
 def _energy_unit(force: float) -> float:
     return force * _length_unit(force)
-
-
-def _distance(got: Vector, exact: Vector) -> float:
-    """Return the l² distance of `got` from `exact`, relative to the norm of `exact`."""
-    return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))

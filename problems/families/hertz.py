@@ -41,7 +41,7 @@ therefore smaller.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
@@ -64,7 +64,7 @@ from mortarbench.problems.contact.bodies import (
     UnassembledBodies,
     structured,
 )
-from mortarbench.problems.contact.friction import FrictionLaw, law_of
+from mortarbench.problems.contact.friction import law_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
 from mortarbench.problems.contact.rigid import RigidPlane
@@ -75,7 +75,7 @@ from mortarbench.problems.duality.newton_case import newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
-    Linearise,
+    keyed_linearisation,
 )
 from mortarbench.problems.families.contact import ContactFamily
 from mortarbench.problems.families.line_contact import LineContact, TangentialContact
@@ -250,12 +250,6 @@ class HertzCylinder(ContactFamily):
             _exact_shear(exact, self) if self.peak else None,
         )
 
-        def linearise(
-            bodies: UnassembledBodies, laws: Sequence[FrictionLaw]
-        ) -> Linearise:
-            rows = linearisation(bodies, self.contact, self.basis, laws)
-            return lambda u: rows(np.zeros_like(u))
-
         def results(answer: ContactSolution) -> dict[str, Any]:
             bodies, primal, s, _, friction = answer.sides
             values = pressure_quantities(bodies, primal, exact, s)
@@ -271,7 +265,7 @@ class HertzCylinder(ContactFamily):
         has_exact = self.friction == "none" or shear is not None
         return ContactProblem(
             bodies=elastic,
-            linearise=linearise,
+            linearise=keyed_linearisation(self.contact, self.basis, undeformed=True),
             results=results,
             stages=stages if shear is None else _programme(self, elastic),
             exact=_curve(exact, shear or np.zeros_like) if has_exact else None,

@@ -29,7 +29,7 @@ a/R, which changes the results by O(a²/R²).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -56,7 +56,6 @@ from mortarbench.problems.contact.stepping import (
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
-    Linearise,
     keyed_linearisation,
 )
 from mortarbench.problems.families.contact import ContactFamily
@@ -245,12 +244,6 @@ class HertzSphere(ContactFamily):
                 "approach_error": approach / exact.approach - 1,
             }
 
-        def linearise(
-            bodies: UnassembledBodies, laws: Sequence[FrictionLaw]
-        ) -> Linearise:
-            rows = keyed_linearisation(self.contact, self.basis)(bodies, laws)
-            return lambda u: rows(np.zeros_like(u))
-
         meshes = (prefixed(b.mesh, k) for b, k in zip(blocks, names, strict=True))
         return ContactProblem(
             bodies=UnassembledBodies(
@@ -265,7 +258,7 @@ class HertzSphere(ContactFamily):
                 pairs=(pair,),
             ),
             stages=stages,
-            linearise=linearise,
+            linearise=keyed_linearisation(self.contact, self.basis, undeformed=True),
             results=results,
         )
 

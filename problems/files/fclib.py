@@ -58,21 +58,6 @@ class FclibFile:
     multipliers: Vector
 
 
-def read_datasets(path: Path) -> Datasets:
-    """Return all arrays of an HDF5 file by HDF5 path, such as fclib_local/W/x.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is not HDF5, is too large, or refers to data in
-        other files.
-
-    """
-    with opened_hdf5(path, "an FCLIB file", 2) as nodes:
-        arrays = {k: node for k, node in nodes.items() if hasattr(node, "dtype")}
-        return {name: np.asarray(node[()]) for name, node in arrays.items()}
-
-
 def read_fclib(path: Path) -> FclibFile:
     """Read an FCLIB file, and reduce a global problem to a local one.
 
@@ -82,7 +67,9 @@ def read_fclib(path: Path) -> FclibFile:
         If the file is damaged or contains rolling friction, or if W is not symmetric.
 
     """
-    arrays = read_datasets(path)
+    with opened_hdf5(path, "an FCLIB file", 2) as nodes:
+        datasets = {k: node for k, node in nodes.items() if hasattr(node, "dtype")}
+        arrays = {name: np.asarray(node[()]) for name, node in datasets.items()}
     with located(str(path)):
         return to_contact(arrays)
 

@@ -191,7 +191,8 @@ class HalfSpace(Family):
             x = (np.arange(self.n) + 0.5) / self.n
             heights = rough_surface(x, self.hurst, self.seed)
             gap -= 0.75 * np.pi * self.roughness * heights.ravel()
-        qp = _normal_qp(cells, gap)
+        P = influence_operator(cells.places, cells.h)
+        qp = QP(P=P, q=gap, lb=np.zeros(gap.size))
         if self.friction == "none":
             return _normal_case(qp, cells, exact, is_rough=is_rough)
         normal = reference(replace(qp, P=assembled(qp.P))).x
@@ -231,15 +232,6 @@ class Cells:
         return float(self.h * np.sqrt(count / np.pi))
 
 
-def _normal_qp(cells: Cells, gap: Vector) -> QP:
-    n = gap.size
-    return QP(
-        P=influence_operator(cells.places, cells.h),
-        q=gap,
-        lb=np.zeros(n),
-    )
-
-
 def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -> Case:
     length = exact.P / (np.pi * exact.E_star * exact.a)
     area = (cells.h * exact.a) ** 2
@@ -271,16 +263,15 @@ def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -
             "force_error": float(s.x.sum()) - 1,
             "p_max_error": float(p.max()) / exact.p0 - 1,
             "contact_radius_error": cells.radius_of(active) - 1,
-            "pressure_l2_error": _distance(p, hertz),
+            "pressure_l2_error": relative_distance(p, hertz),
         }
 
     def fields(s: Solution) -> Fields:
         p = s.x * exact.P / area
         force = np.zeros((p.size, 3))
         force[:, 2] = p * area
-        return _surface(
-            cells,
-            exact,
+        return surface_fields(
+            exact.a * cells.centres,
             ContactSide(
                 name=SIDE,
                 nodes=np.arange(p.size),
@@ -394,15 +385,14 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
         return results | {
             "c_over_a_error": stick_radius * exact.a / sheared.c - 1,
             "force_error": float(force[:, 0].sum()) / sheared.Q - 1,
-            "shear_l2_error": _distance(force, mindlin),
+            "shear_l2_error": relative_distance(force, mindlin),
         }
 
     def fields(s: Solution) -> Fields:
         force = np.empty((k, 3))
         force[:, :2], force[:, 2] = -unit * s.x.reshape(k, 2), exact.P * loading.normal
-        return _surface(
-            cells,
-            exact,
+        return surface_fields(
+            exact.a * cells.centres,
             ContactSide(
                 name=SIDE,
                 nodes=np.arange(k),
@@ -434,17 +424,17 @@ def _curves(
     return np.column_stack([r, exact.pressure(r), shear])
 
 
-def _surface(cells: Cells, exact: PointContact, side: ContactSide) -> Fields:
+def surface_fields(centres: NDArray[np.float64], side: ContactSide) -> Fields:
     """Return tractions at the centres of cells, as fields without a mesh.
 
     The tractions act on the upper surface, which Q pushes along +x.
+
+    centres : (k, dim − 1) positions, m
     """
-    k = len(cells.places)
-    points = np.zeros((k, 3))
-    points[:, :2] = exact.a * cells.centres
+    points = np.column_stack([centres, np.zeros(len(centres))])
     return Fields(
         points=points,
-        displacement=np.zeros((k, 3)),
+        displacement=np.zeros_like(points),
         cells=np.zeros((0, 4), dtype=np.int64),
         bodies=np.zeros(0, dtype=np.int64),
         contact_nodes=side.nodes,
@@ -453,6 +443,6 @@ def _surface(cells: Cells, exact: PointContact, side: ContactSide) -> Fields:
     )
 
 
-def _distance(got: NDArray[np.float64], exact: NDArray[np.float64]) -> float:
+def relative_distance(got: NDArray[np.float64], exact: NDArray[np.float64]) -> float:
     """Return the l² distance of `got` from `exact`, relative to the norm of `exact`."""
     return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))
