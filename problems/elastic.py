@@ -61,7 +61,6 @@ from mortarbench.problems.fem.mesh import (
 from mortarbench.problems.fem.mesh_files.named import NamedMesh
 from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.problems.feti.subdomains import GLUE
-from mortarbench.problems.keys import LAW_PARAMETERS, LAWS, physical
 
 __all__ = [
     "Bodies",
@@ -115,8 +114,8 @@ def one_step(
     ------
     InputError
         If the form is unknown, no slave node faces the master side, the load of a body
-        cannot be balanced, the friction law is unknown or its parameter is negative,
-        the fixed-point iteration does not converge, or `parts` or `glue` is invalid.
+        cannot be balanced, Coulomb's law has no `reference`, the fixed-point iteration
+        does not converge, or `parts` or `glue` is invalid.
 
     """
     if form not in FORMS:
@@ -127,7 +126,12 @@ def one_step(
         raise InputError(
             f"parts with form {form} is not built; expected form dual, or parts=0"
         )
-    law = FrictionLaw() if friction is None else _check_law(friction, reference)
+    law = FrictionLaw() if friction is None else friction
+    if law.mu and reference is None:
+        raise InputError(
+            "friction coulomb needs a reference solver; expected the argument "
+            "`reference` of `Family.build`"
+        )
     laws = (law,) * len(bodies.pairs)
     # without grids, `parts` is the number of subdomains for structured bodies as well
     bodies = replace(bodies, shape=Shape(bodies.mesh, bodies.body))
@@ -144,28 +148,6 @@ def one_step(
     )
     choice = Choice(size=parts, glue=glue)
     return case_of(problem, form, choice, reference or _no_reference)
-
-
-def _check_law(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
-    """Check the name, the parameter and the reference of a law, and return the law."""
-    if law.kind not in LAWS:
-        raise InputError(
-            f"friction {law.kind!r} is unknown; expected "
-            + " or ".join(map(repr, LAWS))
-        )
-    if key := LAWS[law.kind]:
-        value = physical(f"friction {law.kind}: {key}", getattr(law, key))
-        if value < 0:
-            raise InputError(
-                f"friction {law.kind}: {key} = {value:g}; expected "
-                + LAW_PARAMETERS[key]
-            )
-    if law.mu and reference is None:
-        raise InputError(
-            "friction coulomb needs a reference solver; expected the argument "
-            "`reference` of `Family.build`"
-        )
-    return law
 
 
 def _no_reference(qp: QP) -> Solution:

@@ -28,6 +28,7 @@ from mortarbench.harness import Friction, InputError, Vector
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.problems.contact.bodies import UnassembledBodies
 from mortarbench.problems.contact.rows import ContactRows
+from mortarbench.problems.keys import LAW_PARAMETERS, LAWS, physical
 
 T = TypeVar("T")
 
@@ -52,6 +53,17 @@ class FrictionLaw:
     bound: float = 0.0  #: bound of Tresca's law on the traction, Pa
     mu: float = 0.0  #: coefficient of Coulomb's law
 
+    def __post_init__(self) -> None:
+        """Check the name of the law and its parameter."""
+        if self.kind not in LAWS:
+            names = " or ".join(map(repr, LAWS))
+            raise InputError(f"friction {self.kind!r} is unknown; expected {names}")
+        if key := LAWS[self.kind]:
+            where = f"friction {self.kind}: {key}"
+            if (value := physical(where, getattr(self, key))) < 0:
+                expected = LAW_PARAMETERS[key]
+                raise InputError(f"{where} = {value:g}; expected {expected}")
+
     @property
     def acts(self) -> bool:
         """True for a law other than "none", even with a bound of zero."""
@@ -61,7 +73,7 @@ class FrictionLaw:
 def law_of(friction: str, bound: float, mu: float) -> FrictionLaw:
     """Return the law from the values of the keys of the same names.
 
-    The values must have been validated; parameters of other laws are ignored.
+    Parameters of other laws are ignored.
     """
     return FrictionLaw(
         friction,

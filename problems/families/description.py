@@ -214,7 +214,6 @@ def read_description(path: Path) -> dict[str, Any]:
             raise unknown("length_unit", unit, LENGTH_UNITS)
         for entry in checked.filled_list("contacts", table["contacts"]):
             checked.table("contacts", entry)
-        _check_friction_values(table)
     return table
 
 
@@ -518,16 +517,6 @@ def _check_loads_act(
             )
 
 
-def _check_friction_values(entry: Mapping[str, Any]) -> None:
-    """Raise InputError if a friction key of an entry has an invalid value."""
-    law = entry.get("friction", "none")
-    if checked.text("friction", law) not in LAWS:
-        raise unknown("value of friction", law, LAWS)
-    for key, what in LAW_PARAMETERS.items():
-        if key in entry and physical(key, entry[key]) < 0:
-            raise InputError(f"{key} = {shown(entry[key])}; expected {what}")
-
-
 def pair_laws(
     contacts: Sequence[Mapping[str, Any]], general: Mapping[str, Any]
 ) -> tuple[FrictionLaw, ...]:
@@ -548,14 +537,15 @@ def pair_laws(
 
 
 def _law(entry: Mapping[str, Any], general: Mapping[str, Any]) -> FrictionLaw:
-    _check_friction_values(entry)
-    law = entry.get("friction", general["friction"])
+    law = checked.text("friction", entry.get("friction", general["friction"]))
+    if law not in LAWS:
+        raise unknown("value of friction", law, LAWS)
     needed = LAWS[law]
     for key in LAW_PARAMETERS:
         if key in entry and key != needed:
             raise InputError(f"{key} is not used by friction {law!r}; expected none")
     values = {key: entry.get(key, general[key]) for key in LAW_PARAMETERS}
-    if needed and values[needed] < 0:
+    if needed and needed not in entry and values[needed] == UNSET:
         raise InputError(f"friction {law!r} needs {needed}, {LAW_PARAMETERS[needed]}")
     return law_of(law, **values)
 

@@ -316,7 +316,8 @@ def _programme(keys: HertzCylinder, elastic: UnassembledBodies) -> tuple[Stage, 
         end : state at the end of the preceding stage
         """
         previous = loads[max(k - 1, 0)][0]
-        at_rest = not k and _slip_starts_at_rest(keys)
+        # slip may be measured from rest instead of the state under P alone
+        at_rest = not k and (not quasi_static or keys.programme == "proportional")
         u = np.zeros_like(end.u) if at_rest else end.u
         slip = u if quasi_static else np.zeros_like(u)
         return State(u, slip, loads[k][0] / previous * end.normal_forces)
@@ -401,11 +402,6 @@ def _loads(keys: HertzCylinder) -> list[tuple[float, float]]:
         parts = (np.arange(1, keys.steps + 1) / keys.steps) ** 2
         return [(part, part * keys.Q) for part in parts]
     return [(1.0, Q) for Q in dict.fromkeys((keys.peak, keys.Q))]
-
-
-def _slip_starts_at_rest(keys: HertzCylinder) -> bool:
-    """Return True if slip is measured from rest instead of the state under P alone."""
-    return keys.loading == "static" or keys.programme == "proportional"
 
 
 def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> Mesh:

@@ -46,14 +46,14 @@ def test_a_case_of_one_step_equals_the_case_of_the_family(form, law, keys):
 
 @pytest.mark.parametrize(
     ("law", "message"),
-    [(FrictionLaw("oily"), "friction 'oily' is unknown; expected 'none' or 'tresca'"),
-     (FrictionLaw("tresca", bound=-1.0), "bound = -1; expected a traction of 0"),
-     (FrictionLaw("coulomb", mu=float("nan")), "mu = nan; expected a number"),
-     (FrictionLaw("coulomb", mu=0.3), "expected the argument `reference`")],
+    [(dict(kind="oily"), "friction 'oily' is unknown; expected 'none' or 'tresca'"),
+     (dict(kind="tresca", bound=-1.0), "bound = -1; expected a traction of 0"),
+     (dict(kind="coulomb", mu=float("nan")), "mu = nan; expected a number"),
+     (dict(kind="coulomb", mu=0.3), "expected the argument `reference`")],
 )  # fmt: skip
 def test_invalid_laws_are_refused_in_one_line(law, message):
     with pytest.raises(InputError) as e:
-        one_step(model(PATCH.with_keys()), "dual", friction=law)
+        one_step(model(PATCH.with_keys()), "dual", friction=FrictionLaw(**law))
 
     assert message in str(e.value)
     assert "\n" not in str(e.value)

@@ -855,7 +855,11 @@ def test_friction_is_the_same_from_the_key_the_file_or_the_pair(
     ("keys", "pair", "message"),
     [
         ("", 'friction = "tresca"', "contacts[0]: friction 'tresca' needs bound"),
-        ("", 'friction = "tresca"\nbound = -1', "contacts[0]: bound = -1; expected a"),
+        (
+            "",
+            'friction = "tresca"\nbound = -1',
+            "friction tresca: bound = -1; expected",
+        ),
         ("", 'friction = "coulomb"\nbound = 1', "contacts[0]: bound is not used by"),
         ("", "mu = 0.1", "contacts[0]: mu is not used by friction 'none'"),
         ("", 'friction = "oily"', "contacts[0]: unknown value of friction 'oily'"),
