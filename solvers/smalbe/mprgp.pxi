@@ -34,11 +34,6 @@ cdef enum:
     # steps for a preconditioned dual. Without the check,
     # `test_a_solve_stalled_by_rounding_ends` fails.
     FIRST_CHECK = 500
-    # Smallest limit of CG steps beyond the boundary if CG uses a factor; with a factor,
-    # few steps suffice to predict the next face. With 1, torsion with n = 300 takes 293
-    # products instead of 186, and a journal bearing with n = 600 takes 318 instead of
-    # 274.
-    BEYOND = 8
     MODEL = 0
     SPECTRAL = 1
     OWN = 2
@@ -47,10 +42,6 @@ cdef enum:
     # and with 40 as with 20, 2 % more with 5, and 35 % more with 1 (a monotone search).
     # With 10 428 discs, it takes 12 % more products with 10.
     MEMORY = 20
-    # Number of steps on an unchanged face before a Newton step. On contact patches with
-    # condition numbers of 1e4 to 6e5, values from 1 to 6 change the number of products
-    # by up to a half.
-    SETTLED_FACE = 3
     # Number of steps before the first Newton step, about the number of products of a
     # Newton step on the contact patches mentioned above. With 10, Mindlin's problem
     # with 1468 discs takes up to 40 % more products. With n unknowns, the number is √n
@@ -256,7 +247,6 @@ cdef class MPRGP:
     cdef Directions directions
     cdef Directions tangents  # directions of CG for a Newton step
     cdef double *marked  # (n,) mask `free` of an earlier face
-    cdef long settled  # number of steps on an unchanged face since that check
     cdef long patience  # number of steps before the next Newton step
     cdef double spectral_length  # α of the last step; 0 before the first one
     cdef double cost_now  # cost relative to the cost at the start of the run
@@ -303,7 +293,6 @@ cdef class MPRGP:
         cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
         cdef double began
         self.cost_now, self.n_costs = 0.0, 0
-        self.settled = 0
         self.record_cost(0.0)
         # Step 0. The face of x, the minimiser along the stored directions on this face, and
         # the first direction of conjugate gradients.
@@ -358,10 +347,7 @@ cdef class MPRGP:
                     inside += 1
                     continue
                 # Step 3. Expansion: the CG step would leave the set.
-                letter = self.expand(
-                    not has_expanded,
-                    max(inside, 1 if self.factor is None else BEYOND), began, trace
-                )
+                letter = self.expand(not has_expanded, max(inside, 1), began, trace)
                 self.layers = 0
                 has_expanded = True
             if not letter:
@@ -590,10 +576,10 @@ cdef class MPRGP:
 
     cdef bint is_settled(self) noexcept:
         """Return True if the face has settled and a Newton step is due."""
-        self.settled = self.settled + 1 if same(self.free, self.marked, self.n) else 0
+        cdef bint is_unchanged = same(self.free, self.marked, self.n)
         memcpy(self.marked, self.free, self.n * sizeof(double))
         self.patience -= 1
-        return self.settled >= SETTLED_FACE and self.patience <= 0
+        return is_unchanged and self.patience <= 0
 
     cdef bint step_by_newton(self, long most, bytearray trace) except -1:
         """Step to the minimiser on tangents of the boundary, projected onto the set.
@@ -612,7 +598,6 @@ cdef class MPRGP:
         cdef long steps = 0
         cdef double *d = self.x2
         cdef const double *z
-        self.settled = 0
         memset(self.phi, 0, n * sizeof(double))
         for i in range(n):
             self.free[i] = 1.0
@@ -920,7 +905,7 @@ cdef class MPRGP:
 
         enough : ‖φ‖² at which CG stops, the value of ‖φ‖² when the face was entered
         most : largest number of steps: the number of CG steps on this face, but at
-            least 1, or at least BEYOND if CG is preconditioned by a factor
+            least 1
         """
         cdef Py_ssize_t n = self.n
         cdef long step
