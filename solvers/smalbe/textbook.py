@@ -628,7 +628,8 @@ def _recovered(problem: Problem, at: State, history: History | None) -> Solution
     qp, rows, omega = problem.qp, problem.rows, problem.omega
     r = problem.F(at.x) + qp.q
     a = problem.norm * at.mu - rows.C @ r
-    a = a + rows.fitted(~omega.active(at.x), r + rows.C.T @ a)
+    if a.size:
+        a = a + rows.fitted(~omega.active(at.x), r + rows.C.T @ a)
     r = r + rows.C.T @ a
     phi, beta = omega.split(at.x, r)
     problem.products += 1  # the product of the caller's test

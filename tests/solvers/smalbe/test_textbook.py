@@ -144,6 +144,13 @@ def test_the_outer_loop_by_hand(name):
     assert s.y == pytest.approx([-1])
 
 
+def test_a_solve_without_rows_prints_nothing(capfd):
+    """LAPACK reports empty systems on stdout, which may be the JSON of a command."""
+    qp = QP.from_arrays(np.eye(2), [-1, 1], lb=0)
+    assert Textbook().prepare(qp, 1e-8)().x == pytest.approx([1, 0])
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_growing_penalty_takes_fewer_outer_iterations():
     """Minimise ½‖x‖² over x₁ + x₂ = 1, x₁ ≤ 0.2: x = (0.2, 0.8) and y = −0.8."""
     qp = QP.from_arrays(np.eye(2), [0, 0], A=[1, 1], b=1, ub=[0.2, np.inf])
