@@ -80,7 +80,7 @@ COULOMB_CASES = (
 )
 CAP = 4  #: largest number of problems of a family in the core
 #: Kernels of OpenBLAS. The last needs a processor with AVX-512.
-KERNELS = ("Haswell", "Prescott", "SkylakeX")
+KERNELS = ("Haswell", "Prescott", "Sandybridge", "SkylakeX")
 #: Eigenvalues of the scaled P below this fraction of the largest count as zero.
 ZERO = 1e-8
 #: Largest n for which all eigenvalues are computed, and their number for larger n.
