@@ -1,0 +1,118 @@
+"""Leaderboard of the public set: measure solvers on its core, and write the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from mortarbench.dataset.items import ITERATION, OPTIMAL, Row, catalogue
+from mortarbench.harness import checked
+from mortarbench.progress import Callback
+from mortarbench.registries import Plugins, Registries
+from mortarbench.reporting import Report
+from mortarbench.results import run
+
+ACCURACY = 1e-6  #: tolerance of the verdicts
+TOLERANCES = (1e-6, 1e-8)  #: tolerances passed to the solvers
+#: Solvers that are measured unless others are requested.
+FLEET = (
+    "smalbe", "smalbe-direct", "pdas", "osqp", "clarabel", "proxqp", "piqp", "daqp",
+    "qpalm", "qoco", "qtqp", "scs", "highs",
+)  # fmt: skip
+
+
+def leaderboard(
+    folder: Annotated[str | Path, "DIR"],
+    *,
+    out: Annotated[str | Path | None, "RUN"] = None,
+    solvers: Annotated[Sequence[str], "--solver NAME"] = (),
+    cases: Annotated[Sequence[str], "--case PATTERN"] = (),
+    repeats: Annotated[int | None, "N"] = None,
+    plugins: Plugins = (),
+    progress: bool | Callback | None = None,
+    registries: Registries | None = None,
+) -> Report:
+    """Measure solvers on the core and the sequences of a set, and rank them by class.
+
+    Every solver is measured at two tolerances, and all answers are judged at 1e-6. The
+    steps of sequences are solved cold and with warm starts. A further call with other
+    solvers adds these to the page.
+
+    Parameters
+    ----------
+    folder : folder of `build`
+    out : result folder; default: ``out/leaderboard``
+    solvers : solvers to measure; default: those that mortarbench comes with
+    cases : measure only these problems: patterns such as ``*/sequences/*``
+    repeats : number of repeats; default: 3
+    plugins : Python files with more solvers
+    progress : see `mortarbench.run`
+    registries : see `mortarbench.run`
+
+    Raises
+    ------
+    InputError
+        If the folder is not a set, or an argument is invalid.
+
+    """
+    path = checked.path("folder", folder).resolve()
+    rows = [r for r in catalogue(path) if r["core"] == "yes" or r["sequence"]]
+    sequences: dict[str, list[str]] = {}
+    for row in rows:
+        if row["sequence"]:
+            sequences.setdefault(row["sequence"], []).append(str(path / row["path"]))
+    every = {"path": [str(path / row["path"]) for row in rows]}
+    problems: list[dict[str, Any]] = [{"family": "file", "params": every}]
+    problems += [
+        {"family": "file", "params": {"path": sorted(files)}, "sequence": "path"}
+        for files in sequences.values()
+    ]
+    suite = {
+        "name": "leaderboard",
+        "tolerances": TOLERANCES,
+        "accuracy": ACCURACY,
+        "repeats": 3,
+        "time_limit": 10.0,
+        "solvers": FLEET,
+        "problems": problems,
+    }
+    measured = run(
+        suite,
+        out=out,
+        solvers=solvers,
+        cases=cases,
+        repeats=repeats,
+        plugins=plugins,
+        progress=progress,
+        registries=registries,
+    )
+    import pandas as pd
+
+    from mortarbench.reports.leaderboard import write_leaderboard
+
+    items = pd.DataFrame(
+        {"case": f"file:{path / row['path']}", "group": group}
+        | {key: row[key] for key in ("name", "sequence")}
+        | {"step": int(row["step"] or 0)}
+        for row in rows
+        for group in groups(row)
+    )
+    files, said = write_leaderboard(measured.folder, items)
+    return Report(files=tuple(files), said=tuple(said))
+
+
+def groups(row: Row) -> Iterator[str]:
+    """Yield the classes of a problem, or the kind of a sequence."""
+    if row["sequence"]:
+        keys = {"newton": "Newton steps", "step": "load steps"}
+        kind = next((keys[k] for k in keys if f"-{k}" in row["sequence"]), "growth")
+        kind = "Coulomb iterations" if row["change"].startswith(ITERATION) else kind
+        yield "jumps" if "jump" in row["sequence"] else kind
+    elif row["kind"] != OPTIMAL:
+        yield "no solution"
+    elif row["discs"] != "0":
+        yield "discs"
+    else:
+        yield "dense" if row["dense"] == "yes" else "sparse"
+        yield "strictly convex" if row["strictly_convex"] == "yes" else "singular"
