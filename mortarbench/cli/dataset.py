@@ -1,13 +1,14 @@
-"""The commands `dataset build`, `dataset check` and `dataset info`."""
+"""The commands on the public set: `dataset build`, `check`, `info`, `leaderboard`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from json import dumps
 from typing import Annotated
 
 from mortarbench import dataset
 from mortarbench.harness.errors import say
-from mortarbench.registries import Registries
+from mortarbench.registries import Plugins, Registries
 
 
 def build_dataset(
@@ -53,4 +54,36 @@ def dataset_info(_: Registries, *, json: bool = False) -> int:
         items = value.items() if isinstance(value, dict) else ()
         text = ", ".join(f"{key} {count}" for key, count in items) or value
         print(f"{name:16} {text}")
+    return 0
+
+
+def leaderboard(
+    registries: Registries,
+    folder: Annotated[str, "DIR"],
+    *,
+    out: Annotated[str | None, "RUN"] = None,
+    solvers: Annotated[Sequence[str], "--solver NAME"] = (),
+    repeats: Annotated[int | None, "N"] = None,
+    plugins: Plugins = (),
+) -> int:
+    """Measure solvers on the core and the sequences of the set, and rank them by class.
+
+    The same command continues an interrupted one; with other solvers, it adds them.
+
+    folder : folder of `dataset build`
+    out : result folder; default: ``out/leaderboard``
+    solvers : measure only these solvers
+    repeats : number of repeats; default: 3
+    plugins : Python files with more solvers
+    """
+    del plugins  # loaded by `main`
+    report = dataset.leaderboard(
+        folder,
+        out=out,
+        solvers=solvers,
+        repeats=repeats,
+        progress=True,
+        registries=registries,
+    )
+    print(report)
     return 0

@@ -44,10 +44,11 @@ COMMANDS = {
     "dataset build": ("dataset.build_dataset", "build the public set in a folder"),
     "dataset check": ("dataset.check_dataset", "check a folder of the public set"),
     "dataset info": ("dataset.dataset_info", "show what the public set contains"),
+    "dataset leaderboard": ("dataset.leaderboard", "rank solvers on the public set"),
     "completion": ("completion.completion", "print a script for bash or zsh"),
 }
 #: help texts of the first words of commands with two words
-GROUPS = {"dataset": "build, check or describe the public set of problems"}
+GROUPS = {"dataset": "build, check or describe the public set, or rank solvers on it"}
 
 
 def main(registries: Registries, argv: Sequence[str]) -> int:

@@ -3,3 +3,4 @@
 from mortarbench.dataset.folder import build as build
 from mortarbench.dataset.folder import check as check
 from mortarbench.dataset.folder import info as info
+from mortarbench.dataset.leaderboard import leaderboard as leaderboard

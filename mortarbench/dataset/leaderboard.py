@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from mortarbench.dataset.items import ITERATION, OPTIMAL, Row, catalogue
 from mortarbench.harness import checked
@@ -23,12 +23,11 @@ FLEET = (
 
 
 def leaderboard(
-    folder: Annotated[str | Path, "DIR"],
+    folder: str | Path,
     *,
-    out: Annotated[str | Path | None, "RUN"] = None,
-    solvers: Annotated[Sequence[str], "--solver NAME"] = (),
-    cases: Annotated[Sequence[str], "--case PATTERN"] = (),
-    repeats: Annotated[int | None, "N"] = None,
+    out: str | Path | None = None,
+    solvers: Sequence[str] = (),
+    repeats: int | None = None,
     plugins: Plugins = (),
     progress: bool | Callback | None = None,
     registries: Registries | None = None,
@@ -44,7 +43,6 @@ def leaderboard(
     folder : folder of `build`
     out : result folder; default: ``out/leaderboard``
     solvers : solvers to measure; default: those that mortarbench comes with
-    cases : measure only these problems: patterns such as ``*/sequences/*``
     repeats : number of repeats; default: 3
     plugins : Python files with more solvers
     progress : see `mortarbench.run`
@@ -81,7 +79,6 @@ def leaderboard(
         suite,
         out=out,
         solvers=solvers,
-        cases=cases,
         repeats=repeats,
         plugins=plugins,
         progress=progress,
