@@ -30,6 +30,7 @@ from mortarbench.reports.document import (
     short,
     short_name,
 )
+from mortarbench.reports.export.records import plain, write_csv, write_parquet
 from mortarbench.reports.figures.curves import answer_figure
 from mortarbench.reports.figures.style import (
     curve,
@@ -66,7 +67,12 @@ def write_leaderboard(
     run = read_measurements(folder)
     document = compose_leaderboard(run, items)
     formats = ("html", "md", "tex", "csv")
-    files = write_document(document, folder / "report", formats, page="leaderboard")
+    target, frame = folder / "report", plain(run.df)
+    files = [
+        *write_document(document, target, formats, page="leaderboard"),
+        write_csv(target / "tables" / "measurements.csv", frame),
+        write_parquet(target / "records.parquet", frame),
+    ]
     said = [
         item
         for section in document.sections[:2]
