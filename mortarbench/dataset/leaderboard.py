@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from mortarbench.dataset.items import ITERATION, OPTIMAL, Row, catalogue
+from mortarbench.dataset.items import OPTIMAL, Row, catalogue
 from mortarbench.harness import checked
 from mortarbench.progress import Callback
 from mortarbench.registries import Plugins, Registries
@@ -15,6 +15,14 @@ from mortarbench.results import run
 
 ACCURACY = 1e-6  #: tolerance of the verdicts
 TOLERANCES = (1e-6, 1e-8)  #: tolerances passed to the solvers
+#: Kinds of sequences, by a part of their names; the others have growing loads or bounds.
+KINDS = {
+    "jumps": "jumps",
+    "iterations": "Coulomb iterations",
+    "newton": "Newton steps",
+    "step": "load steps",
+}
+GROWTH = "growing loads, bounds"
 #: Solvers that are measured unless others are requested.
 FLEET = (
     "smalbe", "smalbe-direct", "pdas", "osqp", "clarabel", "proxqp", "piqp", "daqp",
@@ -101,11 +109,9 @@ def leaderboard(
 
 def groups(row: Row) -> Iterator[str]:
     """Yield the classes of a problem, or the kind of a sequence."""
-    if row["sequence"]:
-        keys = {"newton": "Newton steps", "step": "load steps"}
-        kind = next((keys[k] for k in keys if f"-{k}" in row["sequence"]), "growth")
-        kind = "Coulomb iterations" if row["change"].startswith(ITERATION) else kind
-        yield "jumps" if "jump" in row["sequence"] else kind
+    parts = row["sequence"].split("-")
+    if parts != [""]:
+        yield next((kind for part, kind in KINDS.items() if part in parts), GROWTH)
     elif row["kind"] != OPTIMAL:
         yield "no solution"
     elif row["discs"] != "0":

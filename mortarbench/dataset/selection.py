@@ -136,6 +136,9 @@ def _items() -> Iterator[Row]:
     for steps in suite.sequences:
         first, last = (case.name.split("/") for case in (steps[0], steps[-1]))
         sequence = _slug(p if p in last else p.partition("=")[0] for p in first)
+        key = next(p.partition("=")[0] for p in first if p not in last)
+        values = [case.params[key] for case in steps]
+        sequence += "-jumps" * (values != sorted(values))
         for step, case in reversed([*enumerate(steps, 1)]):
             yield _row(case.name, "", OPTIMAL, sequence, step)
     for name in COULOMB_CASES:
