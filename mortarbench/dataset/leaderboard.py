@@ -15,7 +15,7 @@ from mortarbench.results import run
 
 ACCURACY = 1e-6  #: tolerance of the verdicts
 TOLERANCES = (1e-6, 1e-8)  #: tolerances passed to the solvers
-#: Kinds of sequences, by a part of their names; the others have growing loads or bounds.
+#: Kinds of sequences, by a part of their names; in others, loads or bounds grow.
 KINDS = {
     "jumps": "jumps",
     "iterations": "Coulomb iterations",
