@@ -79,7 +79,7 @@ def leaderboard(
         "tolerances": TOLERANCES,
         "accuracy": ACCURACY,
         "repeats": 3,
-        "time_limit": 10.0,
+        "time_limit": 2.0,  # s; about 100 times the time of the fastest solver
         "solvers": FLEET,
         "problems": problems,
     }
