@@ -79,9 +79,6 @@ cdef class FeasibleSet:
             )
         return 0
 
-    cdef bint has_bound(self, Py_ssize_t i) noexcept:
-        return self.lower[i] > -INFINITY or self.upper[i] < INFINITY
-
     cdef void project(
         self, const double *x, double alpha, const double *p, double *y
     ) noexcept:

@@ -53,13 +53,6 @@ cdef zeros(Py_ssize_t n):
     return cnp.PyArray_ZEROS(1, &size, cnp.NPY_DOUBLE, 0)
 
 
-cdef matrix(Py_ssize_t rows, Py_ssize_t n):
-    """Return a new array (rows, n) of zeros."""
-    cdef cnp.npy_intp[2] sizes
-    sizes[0], sizes[1] = rows, n
-    return cnp.PyArray_ZEROS(2, sizes, cnp.NPY_DOUBLE, 0)
-
-
 def _whole(a):
     return np.ascontiguousarray(a, dtype=float)
 

@@ -132,7 +132,7 @@ def lanczos(Product F, Rows C, start, int steps):
         k = kept - 1 - i
         value[i] = diagonal[k]
         residual[i] = beta * fabs(S[k * kept + kept - 1])
-    vectors = matrix(kept if residual[0] <= RITZ_RESIDUAL * value[0] else 0, n)
+    vectors = np.zeros((kept if residual[0] <= RITZ_RESIDUAL * value[0] else 0, n))
     vector = address(vectors)
     for i in range(len(vectors)):
         k = kept - 1 - i

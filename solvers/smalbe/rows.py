@@ -80,11 +80,7 @@ class Rows(ABC):
 
     def project(self, v: Vector) -> Vector:
         """Return 𝒫v with 𝒫 = I − CᵀC."""
-        return self.combined(1.0, v, -1.0, self.C @ v)
-
-    def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
-        """Return s·v + t·Cᵀa."""
-        return s * v + t * (self.C.T @ a)
+        return np.asarray(v - self.C.T @ (self.C @ v))
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
         """Return the minimiser a (r,) of ‖(r + Cᵀa)_F‖ on the free components F."""
