@@ -402,6 +402,31 @@ def test_a_floating_membrane_on_an_obstacle():
     assert kkt_residuals(qp, s).worst <= 1e-8
 
 
+@pytest.mark.parametrize("spread", [10, 1e3, 1e6])
+def test_a_varying_diagonal_of_trilinear_elements_preconditions_cg(spread):
+    """With units of variables that differ by three orders of magnitude, CG without the
+    diagonal takes more than 40 000 products.
+    """
+    n, rng = 30, np.random.default_rng(1)
+    T = diags_array(
+        [-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]
+    )
+    M = diags_array(
+        [np.ones(n - 1), 4 * np.ones(n), np.ones(n - 1)], offsets=[-1, 0, 1]
+    )
+    P = kron(kron(T, M), M) + kron(kron(M, T), M) + kron(kron(M, M), T)
+    unit = diags_array(spread ** rng.uniform(-0.25, 0.25, n**3))
+    P = csr_array(unit @ P @ unit)
+    q = -np.sin(np.linspace(0, 9, n**3)) * unit.diagonal()
+    qp = boxed(P, q, np.zeros(n**3), np.full(n**3, np.inf))
+    s = SOLVERS["smalbe"].prepare(qp, 1e-8)()
+
+    assert not has_sparse_factor(qp)
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 1e-8
+    assert s.counts["P_products"] <= 200
+
+
 def test_a_sequence_starts_from_the_previous_solution():
     qp = primal("journal-bearing/n=40/eccentricity=0.9")
     prepare = FACTORS.chain(1e-8)
