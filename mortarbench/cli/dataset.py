@@ -69,11 +69,12 @@ def leaderboard(
     """Measure solvers on the core and the sequences of the set, and rank them by class.
 
     The same command continues an interrupted one; with other solvers, it adds them.
+    With other plug-ins, it needs another RUN.
 
     folder : folder of `dataset build`
     out : result folder; default: ``out/leaderboard``
     solvers : measure only these solvers
-    repeats : number of repeats; default: 3
+    repeats : number of repeats; default: 2
     plugins : Python files with more solvers
     """
     del plugins  # loaded by `main`

@@ -286,3 +286,24 @@ def test_the_optima_of_qpbenchmarks_solvers_are_ours(built):
             problem, "clarabel", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12
         )
         assert abs(found.obj - optima[name]) < 1e-8
+
+
+def test_an_own_solver_gets_its_place(copy, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in NAMES:
+        rewrite_catalogue(copy, name, core=lambda _: "yes")
+    assert main("new", "solver", "mine") == 0
+    named = [a for name in ("pdas", "daqp", "mine") for a in ("--solver", name)]
+    board = ("dataset", "leaderboard", str(copy), "--plugin", "mine.py", *named)
+    assert main(*board) == 0
+    said = capsys.readouterr().out
+    report = tmp_path / "out/leaderboard/report"
+    text = (report / "leaderboard.md").read_text()
+
+    assert "dense, tol 1e-6" in said
+    for name in ("pdas", "daqp", "mine"):
+        assert name in text
+    for group in ("dense", "sparse", "discs", "no solution", "sequences"):
+        assert f"\n| {group}<br>" in text
+    assert "Warm starts cost time" in text
+    assert (report / "records.parquet").is_file()
