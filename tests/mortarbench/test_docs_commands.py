@@ -71,6 +71,9 @@ ELSEWHERE = {
     "mortarbench paper --quick": "test_paper.py, with fewer samples",
     "mortarbench replay out/demo RUN_ID": "it needs a run_id; docs/python.md",
     "mortarbench replay out/sizes SESSION-RUN_ID": "the same",
+    "mortarbench dataset leaderboard contact-set": "test_folder.py, on seven items",
+    "mortarbench dataset leaderboard contact-set --plugin mine.py --solver mine "
+    "--solver smalbe --solver piqp --out out/mine": "the same",
     "mortarbench run ranks": "test_ranks.py, a smaller suite of ranks",
     "mortarbench run fleet --dask tcp://login1:8786": "test_cluster.py",
     "mortarbench run fleet --dask tls://login1:8786": "test_cluster.py",
