@@ -24,6 +24,7 @@ from mortarbench.reports.document import (
     Section,
     Table,
     clean,
+    interval,
     number,
     plural,
     seconds,
@@ -259,7 +260,8 @@ def _warm_by_kind(
             p = found.get((kind, solver))
             times = f"{seconds(of.cold.mean())} → {seconds(of.warm.mean())}"
             cells.append(
-                f"{short(p)}\n{times}\nfaster on {won.sum()} of {len(won)}"
+                f"{number(p.ratio.value, 2)} ×\n{interval(p.ratio)}\n{times}\n"
+                f"faster on {won.sum()} of {len(won)}"
                 if p
                 else ABSENT
             )
@@ -301,7 +303,7 @@ def _figure(solves: pd.DataFrame, solvers: tuple[str, ...]) -> Figure:
                 ratio = times.sequence_total_seconds / times.cold_total_seconds
                 curve(one, ratio.index, ratio.to_numpy(), **look(solvers, solver))
             one.axhline(1, color="0.4", lw=0.6)
-            one.set_title(legible(f"{kind}: {of.sequence.iloc[0]}", 64))
+            one.set_title(legible(str(kind)))
             one.set_xlabel("step")
             one.set_yscale("log")
         axes[0].set_ylabel("warm time / cold time")

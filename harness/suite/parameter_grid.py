@@ -90,8 +90,8 @@ def expand_problems(
                 names = tuple(case.name for case in cases)
                 if axis == steps:
                     sequences[names] = tuple(cases)
-                elif steps is None and len(cases) > 1:
-                    lines.append(names)
+                elif steps is None and len(cases) > 1 and "path" not in axes[axis][0]:
+                    lines.append(names)  # files are no series of growing problems
     return Cases(
         cold=tuple(cold.values()),
         sequences=tuple(sequences.values()),
