@@ -53,7 +53,7 @@ def _attributes(
 ) -> Markup:
     """Return the classes of a cell: alignment, and the solver of its column."""
     classes = ["text"] * (column < table.texts)
-    if len(cell) > LONG:
+    if max(map(len, cell.split("\n"))) > LONG:
         classes = ["long"]
     if head in place:
         classes.append(f"solver{place[head]}")

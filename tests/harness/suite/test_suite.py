@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 
 import pytest
 
+import mortarbench as mb
 from mortarbench import problems, solvers
 from mortarbench.harness import InputError, Range
 from mortarbench.harness.plugin import Family
@@ -368,6 +369,21 @@ def test_lines_of_a_grid_differ_in_one_list_only(load):
     assert {soft, hard} < set(suite.lines)
     assert set(suite.lines) - {soft, hard} == set(zip(soft, hard, strict=True))
     assert load(MINIMAL).lines == ()
+
+
+def test_files_in_a_list_are_no_series_of_growing_problems(tmp_path):
+    """A limit on one file must not skip other files."""
+    for n in (10, 20):
+        mb.export(f"string/n={n}/primal", tmp_path / f"{n}.npz")
+    file = tmp_path / "files.toml"
+    file.write_text(
+        'name = "files"\nsolvers = ["osqp"]\n[[problems]]\nfamily = "file"\n'
+        'params = { path = "*.npz" }\n'
+    )
+    suite = load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
+
+    assert len(suite.cases) == 2
+    assert suite.lines == ()
 
 
 def test_a_list_among_the_options_spans_a_grid_of_labelled_solvers(load):
