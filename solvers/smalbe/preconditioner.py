@@ -116,7 +116,9 @@ def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
     pays = P.levels * P.spread**0.25 >= MIN_DIFFICULTY
     if pays and P.pairs <= MAX_PAIRS * qp.P.nnz:
         return "incomplete"
-    return "diagonal" if P.spread >= MIN_SPREAD else "model"
+    # with a zero on the diagonal, P may have no inverse and the QP no minimum
+    varies = MIN_SPREAD <= P.spread < np.inf and P.pairs < np.inf
+    return "diagonal" if varies else "model"
 
 
 def incomplete_factor(qp: QP) -> tuple[float, IncompleteFactor]:
