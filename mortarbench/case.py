@@ -30,6 +30,7 @@ EXPORTS = (
     ".parquet",
     ".qps",
     ".json",
+    ".bin",
     ".cbf",
 )  #: suffixes of exported QPs
 
@@ -180,13 +181,10 @@ class Case(plugin.Case):
                 from mortarbench.problems.files.qps import save_qps
 
                 save_qps(path, self.qp, meta)
-            case ".json" | ".cbf":
-                from mortarbench.solvers.common import conic_files
+            case ".json" | ".bin" | ".cbf" as suffix:
+                from mortarbench.solvers.common.conic_files import WRITERS
 
-                save = conic_files.save_cbf
-                if path.suffix == ".json":
-                    save = conic_files.save_clarabel
-                save(path, self.qp)
+                WRITERS[suffix](path, self.qp)
             case _:
                 from mortarbench.harness.files.qpfile import save_qp
 
@@ -266,19 +264,19 @@ def as_case(
 
 def export(
     case: Annotated[object, "CASE"],
-    path: Annotated[str | Path, "FILE.npz|mat|parquet|qps|json|cbf"],
+    path: Annotated[str | Path, "FILE.npz|mat|parquet|qps|json|bin|cbf"],
     *,
     plugins: Plugins = (),
     registries: Registries | None = None,
 ) -> Path:
-    """Write a QP for other programs: .npz, .mat, .parquet, .qps, .json or .cbf.
+    """Write a QP to a file for other programs, in one of seven formats.
 
     Parameters
     ----------
     case : FAMILY/key=value/…/FORM, such as beam-ring/Nr=4/Nh=3/dual; see docs/cases.md.
         In Python also a case of `build`, a QP, or a problem of qpsolvers or cvxpy
     path : file to write; the suffix selects the format: npz (NumPy), mat (MATLAB,
-        Octave), parquet (qpbenchmark), qps, json (Clarabel), or cbf (CBLIB)
+        Octave), parquet (qpbenchmark), qps, json (Clarabel), bin (QOCO), or cbf (CBLIB)
     plugins : Python files with more families
     registries : used for a name instead of built-in registries, installed plug-ins and
         `plugins`

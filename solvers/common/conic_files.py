@@ -1,10 +1,11 @@
-"""Files of conic solvers: the JSON of Clarabel, and the Conic Benchmark Format.
+"""Files of conic solvers: Clarabel's JSON, QOCO's `.bin`, and CBF.
 
-Both contain the rows of `to_cone`. Discs and cones are second-order cones in them.
+All contain the rows of `to_cone`. Discs and cones are second-order cones in them.
 
-References: https://clarabel.org; H. A. Friberg, CBLIB 2014: a benchmark library for
+References: https://clarabel.org; the layout of `.bin` in the folder `benchmarks` of
+https://github.com/qoco-org/qoco; H. A. Friberg, CBLIB 2014: a benchmark library for
 conic mixed-integer and continuous optimization, Math. Program. Comput. 8 (2016), and
-its description of CBF, version 1.
+its description of the Conic Benchmark Format (CBF), version 1.
 """
 
 from __future__ import annotations
@@ -36,6 +37,23 @@ def save_clarabel(path: Path, qp: QP) -> None:
         "cones": [{kind: size} for kind, size in cones if size],
     }
     _write(path, json.dumps(data))
+
+
+def save_qoco(path: Path, qp: QP) -> None:
+    """Write a QP as `.bin` of QOCO: sizes, vectors, and the columns of P, A and G."""
+    form = to_cone(qp)
+    m = form.equalities
+    P = csc(triu(csc(explicit_matrices(qp)[0]["P"])))
+    matrices = [P, csc(form.rows[:m]), csc(form.rows[m:])]
+    sizes = [qp.q.size, form.rhs.size - m, m, form.inequalities, form.cones.size]
+    with replacing(path) as file:
+        for size in sizes + [M.nnz for M in matrices]:
+            file.write(np.int32(size).tobytes())
+        for vector in qp.q, form.rhs[:m], form.rhs[m:], form.cones.astype(np.int32):
+            file.write(vector.tobytes())
+        for M in matrices:
+            for part in M.data, M.indices.astype(np.int32), M.indptr.astype(np.int32):
+                file.write(part.tobytes())
 
 
 def save_cbf(path: Path, qp: QP) -> None:
@@ -109,3 +127,7 @@ def _by_columns(M: Any) -> dict[str, Any]:
 def _write(path: Path, text: str) -> None:
     with replacing(path) as file:
         file.write(text.encode())
+
+
+#: function that writes the files with a suffix
+WRITERS = {".json": save_clarabel, ".bin": save_qoco, ".cbf": save_cbf}

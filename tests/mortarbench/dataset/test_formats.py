@@ -4,8 +4,9 @@ import clarabel
 import highspy
 import numpy as np
 import pytest
+import qoco
 from scipy.io import loadmat
-from scipy.sparse import csc_array, tril
+from scipy.sparse import csc_array, csc_matrix, tril, triu
 
 import mortarbench as mb
 from tests.support.cbf import read_cbf
@@ -39,6 +40,37 @@ def test_clarabel_solves_its_file_to_the_same_objective(qp, tmp_path):
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-12
     solved = clarabel.load_from_file(str(path), settings).solve()
     assert solved.obj_val == pytest.approx(optimum(qp)[0], abs=1e-10)
+
+
+def setup_of_bin(path):
+    """Return the arguments of QOCO's `setup` from a file, by its documented layout."""
+    data, at = path.read_bytes(), 0
+
+    def read(kind, count):
+        nonlocal at
+        at += count * np.dtype(kind).itemsize
+        return np.frombuffer(data, kind, count, at - count * np.dtype(kind).itemsize)
+
+    n, m, p, linear, cones, *entries = read("<i4", 8)
+    c, b, h, q = read("<f8", n), read("<f8", p), read("<f8", m), read("<i4", cones)
+    matrices = []
+    for rows, count in zip((n, p, m), entries, strict=True):
+        values, place = read("<f8", count), read("<i4", count)
+        columns = (values, place, read("<i4", n + 1))
+        matrices.append(csc_matrix(columns, shape=(rows, n)) if rows else None)
+    assert at == len(data)
+    P, A, G = matrices
+    return n, m, p, P + triu(P, 1).T, c, A, b, G, h, linear, cones, q
+
+
+@pytest.mark.parametrize("qp", [BOX, DISC], ids=["box", "disc"])
+def test_qoco_solves_its_file_and_dumps_the_same_bytes(qp, tmp_path):
+    path, solver = mb.export(qp, tmp_path / "one.bin"), qoco.QOCO()
+    again = tmp_path / "again.bin"
+    tight = dict.fromkeys(["abstol", "reltol"], 1e-12)
+    solver.setup(*setup_of_bin(path), **tight, verbose=0, dump_problem=str(again))
+    assert again.read_bytes() == path.read_bytes()
+    assert solver.solve().obj == pytest.approx(optimum(qp)[0], abs=1e-10)
 
 
 def test_highs_reads_qps_with_the_same_objective(tmp_path):

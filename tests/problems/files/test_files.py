@@ -715,7 +715,7 @@ def test_unknown_export_formats_are_refused_with_the_available_ones(written, com
     assert code == 2
     assert err == (
         "mortarbench: a.csv: unknown format '.csv'; expected .npz or .mat or .parquet "
-        "or .qps or .json or .cbf\n"
+        "or .qps or .json or .bin or .cbf\n"
     )
 
 
