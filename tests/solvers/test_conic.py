@@ -90,29 +90,16 @@ NORMWISE = ("scs", "cvxpy:SCS")
 RESIDUAL = dict.fromkeys(NORMWISE, 1e-6)
 
 
-def check_solution(name, seed, tol=1e-8):
-    qp, best = conic_qp(seed)
-    s = solver_of(name).prepare(qp, tol)()
-
-    value = qp.objective(best.x)
-    worst = kkt_residuals(qp, s).worst
-    assert worst <= RESIDUAL.get(name, 10 * tol)
-    assert s.status is Status.SOLVED
-    assert qp.objective(s.x) == pytest.approx(value, rel=1e-8)
-    assert np.abs(s.x - best.x).max() <= ERROR.get(name, OTHER_ERROR)
-
-
 @pytest.mark.parametrize("name", NATIVE + WILDCARDS)
 def test_planted_solutions_of_discs_and_cones_are_reached(name):
-    for seed in range(5):
-        check_solution(name, seed)
+    for seed in range(10):
+        qp, best = conic_qp(seed)
+        s = solver_of(name).prepare(qp, 1e-8)()
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NATIVE + WILDCARDS)
-def test_500_planted_solutions_are_reached(name):
-    for seed in range(500):
-        check_solution(name, seed)
+        assert kkt_residuals(qp, s).worst <= RESIDUAL.get(name, 1e-7)
+        assert s.status is Status.SOLVED
+        assert qp.objective(s.x) == pytest.approx(qp.objective(best.x), rel=1e-8)
+        assert np.abs(s.x - best.x).max() <= ERROR.get(name, OTHER_ERROR)
 
 
 @pytest.mark.parametrize("name", ["clarabel", "scs", "qoco"])

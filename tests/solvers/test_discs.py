@@ -8,10 +8,9 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import aslinearoperator
 
 import mortarbench as mb
-from mortarbench.harness import QP, Box, Discs, Solution, Status
+from mortarbench.harness import QP, Box, Discs, Status
 from mortarbench.solvers import SOLVERS
 from tests.support.discs import mindlin, natural_map, qp_on_cones, qp_on_discs
-from tests.support.slow_seeds import seeds
 
 SMALBES = ["smalbe", "smalbe-paper", "smalbe-espreso"]
 ON_CONES = ["projected-gradient", "nsgs"]
@@ -20,14 +19,7 @@ TOL = 1e-9
 
 
 def solve(name, qp, tol=TOL, **options):
-    solver = SOLVERS[name]
-    s = (
-        type(solver)(**options).prepare(qp, tol)()
-        if options
-        else solver.prepare(qp, tol)()
-    )
-    assert isinstance(s, Solution)
-    return s
+    return replace(SOLVERS[name], **options).prepare(qp, tol)()
 
 
 def assert_solved(name, qp, x=None, *, digits=1e-6):
@@ -45,34 +37,30 @@ def assert_solved(name, qp, x=None, *, digits=1e-6):
 
 
 @pytest.mark.parametrize("name", ON_DISCS)
-@pytest.mark.parametrize("seed", seeds(2, 500))
-def test_planted_solutions_on_discs_are_reached(name, seed):
-    qp, x = qp_on_discs(seed, dim=2 + seed % 2)
-    assert_solved(name, qp, x)
+def test_planted_solutions_on_discs_are_reached(name):
+    for seed in range(20):
+        assert_solved(name, *qp_on_discs(seed, dim=2 + seed % 2))
 
 
 @pytest.mark.parametrize("name", ON_CONES)
-@pytest.mark.parametrize("seed", seeds(3, 500))
-def test_planted_solutions_on_cones_are_reached(name, seed):
-    qp, x = qp_on_cones(seed, dim=2 + seed % 3)
-    assert_solved(name, qp, x)
+def test_planted_solutions_on_cones_are_reached(name):
+    for seed in range(20):
+        assert_solved(name, *qp_on_cones(seed, dim=2 + seed % 3))
 
 
 @pytest.mark.parametrize("name", ON_DISCS)
-@pytest.mark.parametrize("seed", seeds(1, 4))
-def test_discs_that_x_touches_without_a_multiplier(name, seed):
+def test_discs_that_x_touches_without_a_multiplier(name):
     """Without strict complementarity, the error of x is of the order of the square
     root of the residuals.
     """
-    qp, x = qp_on_discs(seed + 100, touching=True)
-    assert_solved(name, qp, x, digits=1e-4)
+    for seed in range(100, 104):
+        assert_solved(name, *qp_on_discs(seed, touching=True), digits=1e-4)
 
 
 @pytest.mark.parametrize("name", ON_DISCS)
-@pytest.mark.parametrize("seed", seeds(1, 4))
-def test_radii_that_differ_by_1e8(name, seed):
-    qp, x = qp_on_discs(seed + 200, spread=8.0)
-    assert_solved(name, qp, x)
+def test_radii_that_differ_by_1e8(name):
+    for seed in range(200, 204):
+        assert_solved(name, *qp_on_discs(seed, spread=8.0))
 
 
 @pytest.mark.parametrize("name", ON_DISCS)
@@ -97,13 +85,11 @@ def test_a_disc_of_one_variable_is_a_bound_with_the_same_counts(name):
 
 
 @pytest.mark.parametrize("name", SMALBES)
-@pytest.mark.parametrize("seed", seeds(2, 4))
-@pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
-def test_equality_rows_beside_discs(name, seed, sparse):
-    qp, x = qp_on_discs(seed + 300, rows=1 + seed % 3)
-    A = csc_array(qp.A) if sparse else qp.A
-    qp = QP.from_arrays(qp.P, qp.q, A=A, b=qp.b, lb=qp.lb, ub=qp.ub, sets=qp.sets[1:])
-    assert_solved(name, qp, x)
+@pytest.mark.parametrize("storage", [np.asarray, csc_array])
+def test_equality_rows_beside_discs(name, storage):
+    for seed in range(300, 304):
+        qp, x = qp_on_discs(seed, rows=1 + seed % 3)
+        assert_solved(name, replace(qp, A=storage(qp.A)), x)
 
 
 def test_small_discs_beside_large_shifts():
@@ -166,20 +152,20 @@ def test_the_history_counts_discs_that_slip():
 #: by Q/μP and number of discs
 PRODUCTS = {
     "projected-gradient": {
-        0.3: {88: 31, 376: 45, 820: 62, 1468: 74},
-        0.9: {88: 24, 376: 38, 820: 47, 1468: 70},
+        0.3: {88: 31, 820: 62},
+        0.9: {88: 24, 820: 47},
     },
     "smalbe": {
-        0.3: {88: 29, 376: 50, 820: 65, 1468: 78},
-        0.9: {88: 29, 376: 39, 820: 47, 1468: 53},
+        0.3: {88: 29, 820: 65},
+        0.9: {88: 29, 820: 47},
     },
 }
 #: the same for MPGP
 PRODUCTS_OF_MPGP = {
-    0.3: {88: 63, 376: 114, 820: 181, 1468: 228},
-    0.9: {88: 67, 376: 122, 820: 164, 1468: 222},
+    0.3: {88: 63, 820: 181},
+    0.9: {88: 67, 820: 164},
 }
-DISCS = [88, *(pytest.param(k, marks=pytest.mark.slow) for k in (376, 820, 1468))]
+DISCS = [88, pytest.param(820, marks=pytest.mark.slow)]
 #: number of products for the norm, the start and the claimed residuals, which the
 #: prototypes do not count
 OF_CLAIM = {"projected-gradient": 3, "smalbe": 3}

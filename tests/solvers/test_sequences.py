@@ -28,8 +28,8 @@ def load_steps():
     return {form: build(form) for form in ("primal", "dual", "dual-bounds")}
 
 
-@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
-def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form):
+@pytest.mark.parametrize(("form", "share"), [("dual", 0.8), ("dual-bounds", 0.9)])
+def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form, share):
     solver, tol = SMALBE(), 1e-8
     prepare = solver.chain(tol)
     warm = [prepare(qp)() for qp in load_steps[form]]
@@ -41,7 +41,7 @@ def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form):
     for qp, s in zip(load_steps[form], warm, strict=True):
         assert s.status is Status.SOLVED
         assert kkt_residuals(qp, s).worst <= 10 * tol
-    assert products(warm) < 0.9 * products(cold)
+    assert products(warm) <= share * products(cold)
 
 
 def test_steps_without_common_data_are_solved(load_steps, manufactured):
@@ -96,21 +96,7 @@ def test_every_product_of_a_sequence_is_counted(load_steps):
         assert s.counts["P_products"] == len(calls)
 
 
-def test_warm_multipliers_and_ritz_pairs_save_products(load_steps):
-    """A step takes on average 44 products from a cold start and 29
-    from a warm one.
-    """
-    solver = SMALBE()
-    prepare = solver.chain(1e-8)
-    warm = [prepare(qp)().counts["P_products"] for qp in load_steps["dual"]]
-    cold = [
-        solver.prepare(qp, 1e-8)().counts["P_products"] for qp in load_steps["dual"]
-    ]
-
-    assert sum(warm[1:]) <= 0.8 * sum(cold[1:])
-
-
-@pytest.mark.parametrize("jump", [1e2, pytest.param(1e4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("jump", [1e2, 1e4])
 def test_a_spectrum_orthogonal_to_the_last_solution_is_detected(manufactured, jump):
     """P = I is followed by a far larger P that agrees with I on the first component."""
     rng = np.random.default_rng(271828)
@@ -138,13 +124,7 @@ def test_a_failure_does_not_affect_the_next_solve(load_steps):
     assert counts[2] == counts[0]
 
 
-@pytest.mark.parametrize(
-    ("form", "tol"),
-    [("dual", 1e-4), ("dual-bounds", 1e-8),
-     *(pytest.param(*row, marks=pytest.mark.slow)
-       for row in [("primal", 1e-4), ("primal", 1e-8), ("dual", 1e-8),
-                   ("dual-bounds", 1e-4)])],
-)  # fmt: skip
+@pytest.mark.parametrize(("form", "tol"), [("dual", 1e-4), ("dual-bounds", 1e-8)])
 def test_qtqp_starts_each_load_step_from_the_last(load_steps, form, tol):
     """Answers meet the same tolerance as from cold starts, with at most nine tenths of
     the iterations.

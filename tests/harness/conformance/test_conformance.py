@@ -52,7 +52,7 @@ from tests.support.faulty_solvers import (
 )
 
 pytestmark = pytest.mark.together  # all tests use the imported libraries
-#: backends that represent the wildcard entries of the registry; other backends are slow
+#: backends that represent the wildcard entries of the registry
 BACKENDS = {
     "qpsolvers:*": ("clarabel", "highs", "quadprog", "sip"),
     "cvxpy:*": ("CLARABEL", "HIGHS"),
@@ -76,8 +76,8 @@ def configured(backends):
 
 
 NATIVE = {name: s for name, s in SOLVERS.items() if name not in BACKENDS}
-SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
+ALL = CONCRETE | configured(OTHERS) | {"sound": Sound()}
 #: checks of conformance, without equivalent formulations, which have a separate test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
 INVARIANT = [check for check in CHECKS if check.startswith(INVARIANCE_PREFIX)]
@@ -94,20 +94,13 @@ def loaded_once():
 
 
 OPTIONS = "refuses a misspelt option"
-UNBOUNDED = "claims no success: unbounded"
-MEMBRANE = "finds where a membrane of 400 nodes touches"
-#: checks in which a solver takes seconds, mostly to reach its iteration limit
-LONG = [
-    ("proxqp", UNBOUNDED),
-    ("projected-gradient", UNBOUNDED), ("nsgs", MEMBRANE),
-]  # fmt: skip
 #: one solver for each type of constraints that our solvers accept, one adapter of a
 #: single library, and one backend of each adapter of several libraries
 REPRESENTATIVES = {
     "smalbe", "pdas", "nsgs", "clarabel", "qpsolvers:quadprog",
     "cvxpy:HIGHS",
 }  # fmt: skip
-#: checks of the other solvers
+#: checks of the other solvers in default runs
 FOR_ALL = {
     "finds the planted solution: bounds",
     "finds the planted solution: everything",
@@ -116,11 +109,11 @@ FOR_ALL = {
     "claims no success: infeasible",
     "takes or declines an operator",
 }
-
-
-def is_by_default(name, check):
-    """Return True if a check runs by default; all checks run for representatives."""
-    return name in REPRESENTATIVES or check in FOR_ALL
+#: checks in which a solver takes seconds to reach its iteration limit
+LONG = {
+    ("nsgs", "finds where a membrane of 400 nodes touches"),
+    ("nsgs", "claims no success: unbounded"),
+}
 
 
 def test_representatives_and_their_checks_exist():
@@ -128,14 +121,15 @@ def test_representatives_and_their_checks_exist():
     assert set(STRICT) >= FOR_ALL
 
 
-def marks(name, check):
-    long = (name, check) in LONG or not is_by_default(name, check)
-    return pytest.mark.slow if long else ()
-
-
 @pytest.mark.parametrize(
     ("name", "check"),
-    [pytest.param(n, c, marks=marks(n, c)) for n in CONCRETE for c in STRICT],
+    [
+        (name, check)
+        for name in CONCRETE
+        for check in STRICT
+        if name in REPRESENTATIVES or (check in FOR_ALL and name not in VARIANTS)
+        if (name, check) not in LONG
+    ],
 )
 def test_a_solver_conforms(name, check):
     grade, message, _ = run_check(check, CONCRETE[name])
@@ -145,11 +139,11 @@ def test_a_solver_conforms(name, check):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("check", STRICT)
-@pytest.mark.parametrize("name", SLOW)
-def test_variants_and_other_backends_conform(name, check):
-    grade, message, _ = run_check(check, SLOW[name])
-    assert grade is not Grade.FAIL, message
+@pytest.mark.parametrize("name", ALL)
+def test_every_solver_passes_or_declines_every_check(name):
+    results = {check: run_check(check, ALL[name]) for check in STRICT}
+    failed = {c: r.message for c, r in results.items() if r.grade is Grade.FAIL}
+    assert failed == {}
 
 
 @pytest.mark.parametrize(
@@ -164,13 +158,6 @@ def test_smalbe_pdas_and_projected_gradient_have_no_weakness(name):
     grades = {run_check(check, NATIVE[name]).grade for check in INVARIANT}
     assert Grade.PASS in grades
     assert grades <= {Grade.PASS, Grade.DECLINE}
-
-
-@pytest.mark.slow  # the command below prints the results of the same checks
-@pytest.mark.parametrize("check", CHECKS)
-def test_a_sound_solver_fails_no_check(check):
-    grade, message, _ = run_check(check, Sound())
-    assert grade is not Grade.FAIL, message
 
 
 @pytest.mark.parametrize(
