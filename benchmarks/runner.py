@@ -24,8 +24,9 @@ from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
+from mortarbench.harness.suite.parameter_grid import Cases
 from mortarbench.harness.suite.solver_options import NULL_SUFFIX
-from mortarbench.harness.suite.suite import Suite
+from mortarbench.harness.suite.suite import Suite, SuiteFile
 from mortarbench.harness.verify.measure import SAMPLE_SECONDS, memory_mib
 from mortarbench.reports.intervals import student
 
@@ -83,9 +84,8 @@ def measure(out, *solvers, repeats, plugin=PLUGIN):
     specs += [replace(specs[0], label=f"{solvers[0]}{NULL_SUFFIX}", role="null")]
     tiny = plugin.problems["tiny"]
     suite = Suite(
-        name="runner", tolerances=(1e-6,), repeats=repeats, time_limit=60.0,
-        memory_limit=4096.0, solvers=tuple(specs), text="",
-        cases=(assemble("tiny", tiny, {}, "plain"),),
+        file=SuiteFile(name="runner", repeats=repeats), solvers=tuple(specs),
+        cases=Cases(cold=(assemble("tiny", tiny, {}, "plain"),)),
     )  # fmt: skip
     watch = Watch()
     run(

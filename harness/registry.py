@@ -246,8 +246,12 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
     return _with_options(spec, solvers[spec.name])
 
 
-def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
+def check_name(
+    name: str, solvers: Mapping[str, Solver], labels: Iterable[str] = ()
+) -> None:
     """Check that `name` is the name of a solver, without importing any solver.
+
+    labels : further names that the message suggests
 
     Raises
     ------
@@ -257,7 +261,7 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
     """
     prefix, colon, _ = name.rpartition(":")
     if name not in solvers and not (colon and f"{prefix}:*" in solvers):
-        raise unknown("solver", name, solvers, more=PLUGINS)
+        raise unknown("solver", name, {*labels, *solvers}, more=PLUGINS)
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
@@ -293,12 +297,10 @@ def is_adapter(solver: object) -> bool:
     return hasattr(solver, "library_settings")
 
 
-def option_value(
-    where: str, value: Any, solver: Solver, key: str, *, strict: bool = True
-) -> Any:
+def option_value(where: str, value: Any, solver: Solver, key: str) -> Any:
     """Convert a value to the first type of an option that admits it.
 
-    strict : False to convert texts as well, such as "1e-6" to a number
+    Texts are converted as well, such as "1e-6" to a number.
 
     Raises
     ------
@@ -307,16 +309,17 @@ def option_value(
 
     """
     kinds = option_types(solver, key)
-    if NoneType in kinds and (value is None or (not strict and value == "none")):
+    is_text = isinstance(value, str)
+    if NoneType in kinds and (value is None or (is_text and value == "none")):
         return None
-    if strict and kinds is _ANY:
+    if kinds is _ANY and not is_text:
         return value
     # scalars of NumPy have an empty shape
     plain = value.item() if getattr(value, "shape", None) == () else value
     for kind in kinds:
         # a TypeError is raised for a class of a plug-in
         with suppress(msgspec.ValidationError, TypeError):
-            return msgspec.convert(plain, kind, strict=strict)
+            return msgspec.convert(plain, kind, strict=not is_text)
     names: list[str] = []
     for kind in kinds:
         choices = get_args(kind) if get_origin(kind) is Literal else ()

@@ -30,7 +30,6 @@ from mortarbench.harness.registry import (
     options_of,
     resolve,
 )
-from mortarbench.harness.suite.solver_options import typed
 from mortarbench.registries import (
     TURN,
     Plugins,
@@ -336,7 +335,7 @@ def solve(
         from mortarbench.harness.environment.environment import digest
         from mortarbench.harness.verify.verdicts import new_record
 
-        spec = with_history(typed(spec, solvers), solvers)
+        spec = with_history(spec, solvers)
         plain = SolverSpec(name=name, label=name)
         default = plain if "history" in requested else with_history(plain, solvers)
         record = new_record(

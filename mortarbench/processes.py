@@ -18,7 +18,6 @@ from mortarbench.harness.processes.ranks import launch
 from mortarbench.harness.processes.solver_file import read_solver
 from mortarbench.harness.processes.worker import Worker, serve
 from mortarbench.harness.registry import SolverSpec, resolve
-from mortarbench.harness.suite.solver_options import typed
 from mortarbench.registries import Registries, with_history
 
 
@@ -39,7 +38,6 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         spec, solvers = SolverSpec(**request["solver"]), registries.solvers
         if "copy" in request:
             solvers = {spec.name: read_solver(Path(request["copy"]))}
-        spec = typed(spec, solvers)
         if request["records"]:
             spec = with_history(spec, solvers)
         solver = resolve(spec, solvers)

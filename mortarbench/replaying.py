@@ -115,21 +115,18 @@ def replay(
     registries = load_registries(plugins, registries)
     run_id = checked.text("run_id", run_id)
     path = checked.result_folder("folder", folder)
-    from mortarbench.harness.results.folder import (
-        differences,
-        environment_of,
-        suite_of,
-    )
+    from mortarbench.harness.results.folder import differences, environment_of
     from mortarbench.harness.results.journal import read_journal
     from mortarbench.harness.results.stored_run import (
         case_of,
         find_record,
         plugins_needed,
     )
+    from mortarbench.harness.suite.suite import read_suite
     from mortarbench.harness.verify.verdicts import judged
 
     then = find_record(path, run_id, read_journal(path))
-    environment, suite = environment_of(path, then.environment), suite_of(path)
+    environment = environment_of(path, then.environment)
     try:
         answer = solve(
             Case(id=case_of(then, registries.families), registries=registries),
@@ -137,7 +134,7 @@ def replay(
             then.tol,
             options=_changed_options(then, registries),
             ranks=then.ranks,
-            time_limit=suite.time_limit,
+            time_limit=read_suite(path / "suite.toml").time_limit,
         )
     except InputError as e:
         needed = plugins_needed(environment) if "unknown" in str(e) else ""

@@ -6,25 +6,26 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+
+from msgspec import to_builtins
 
 from mortarbench.answer import PICTURES
 from mortarbench.harness import checked
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.errors import shown as given
-from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, toml
+from mortarbench.harness.files.reading import toml
 from mortarbench.harness.record import REFUTED, Record, Verdict
 from mortarbench.harness.registry import is_solver, resolve
 from mortarbench.harness.results.folder import keep_environment, refuse_links
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.running.progress import Progress
-from mortarbench.harness.suite.overrides import with_overrides
-from mortarbench.harness.suite.solver_options import listed_options
-from mortarbench.harness.suite.suite import as_toml, parse_suite, suite_file
+from mortarbench.harness.suite.solver_options import listed_options, selected, sweep
+from mortarbench.harness.suite.suite import as_toml, expanded, read_suite, suite_file
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import TURN, Plugins, Registries, load_registries
 from mortarbench.reporting import Report, report
@@ -234,7 +235,7 @@ def merge(
     out: Annotated[str | Path, "DIR"],
     tell: Callable[[str], None] = ignore,
 ) -> Results:
-    """Merge result folders into a new folder or the result of an earlier merge.
+    """Merge result folders into a new folder.
 
     All measurements are kept: sessions on one machine are pooled in reports, and
     environments are reported separately. A measurement that several folders contain is
@@ -243,7 +244,7 @@ def merge(
     Parameters
     ----------
     folders : result folders of `run` or `merge`
-    out : a new folder, or the result of an earlier merge, which is extended
+    out : a new folder
     tell : called with messages about repeated measurements, files too large to be
         copied, and missing solutions and environments
 
@@ -252,7 +253,7 @@ def merge(
     InputError
         If a folder contains no measurements, if two folders contain different records
         of one measurement, or if the suites of two folders differ in their limits,
-        their accuracy or the meaning of a label; `out` is then unchanged.
+        their accuracy or the meaning of a label, or if `out` contains measurements.
 
     """
     if not folders:
@@ -352,28 +353,35 @@ def run(
     folder = None if out is None else checked.path("out", out)
     if not isinstance(dask, str | None):
         raise InputError(f"dask = {given(dask)}; expected the address of a scheduler")
-    path = Path("suite") if isinstance(suite, Mapping) else registries.suite_path(suite)
-    if not isinstance(suite, Mapping):
-        text = read_text(path, "a TOML file", MAX_TOML_MIB)
-    with located(f"{path}"):
-        if isinstance(suite, Mapping):
-            text = as_toml(suite)
-        folder = folder or Path("out") / suite_file(toml(text)).name
+    if isinstance(suite, Mapping):
+        path = Path("suite")
+        with located(f"{path}"):
+            file = suite_file(toml(as_toml(suite)))
+    else:
+        path = registries.suite_path(suite)
+        file = read_suite(path)
+    folder = folder or Path("out") / file.name
     fresh = checked.flag("fresh", fresh)
     if folder.is_dir():
         refuse_links(folder)
-    families = registries.families
-    asked = with_overrides(
-        parse_suite(text, f"{path}", path.parent, families, registries.solvers),
-        families,
-        registries.solvers,
-        solvers=checked.texts("solvers", solvers),
-        cases=checked.texts("cases", cases),
-        repeats=repeats,
-        time_limit=time_limit,
-        memory_limit=memory_limit,
-        options=listed_options({} if options is None else options),
-    )
+    changes = {
+        "repeats": repeats,
+        "time_limit": time_limit,
+        "memory_limit": memory_limit,
+    }
+    changed = {key: value for key, value in changes.items() if value is not None}
+    file = suite_file({**to_builtins(file), **changed})
+    solvers = checked.texts("solvers", solvers)
+    patterns = checked.texts("cases", cases)
+    options = listed_options({} if options is None else options)
+    families, known = registries.families, registries.solvers
+    with located(f"{path}"):
+        asked = expanded(file, path.parent, families, known)
+    if patterns:
+        chosen = asked.cases.selected(patterns, families)
+        asked = replace(asked, cases=chosen)
+    specs = selected(asked.solvers, solvers, known) if solvers else asked.solvers
+    asked = replace(asked, solvers=sweep(specs, options, known))
     from mortarbench.harness.environment.doctor import is_busy
     from mortarbench.harness.environment.environment import digest
     from mortarbench.harness.running.executor import execute as execute_here
@@ -416,6 +424,6 @@ def run(
         folder=folder,
         records=tuple(records),
         solvers=tuple(s.label for s in asked.solvers),
-        cases=frozenset(case.name for case in asked.names),
+        cases=frozenset(case.name for case in asked.cases.all),
         missing=missing,
     )

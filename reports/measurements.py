@@ -22,7 +22,7 @@ from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.harness.results.folder import environment_of, times_compare
 from mortarbench.harness.results.frame import frame_of
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.suite.suite import SuiteFile, read_stored
+from mortarbench.harness.suite.suite import SuiteFile, read_suite
 from mortarbench.harness.verify.kkt import rejudged
 
 DERIVED = {
@@ -158,7 +158,7 @@ def read_measurements(folder: Path, factor: float = VERIFIED_FACTOR) -> Measurem
     return Measurements(
         folder=folder,
         df=df,
-        suite=read_stored(suite) if suite.exists() else None,
+        suite=read_suite(suite) if suite.exists() else None,
         environments=environments,
         factor=factor,
     )

@@ -12,6 +12,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from msgspec import to_builtins
+
 from mortarbench.harness.environment.environment import VOLATILE
 from mortarbench.harness.environment.labels import in_words
 from mortarbench.harness.errors import InputError, shortened, some
@@ -20,14 +22,10 @@ from mortarbench.harness.files.durable import (
     replace_file,
     report_full_disk,
 )
-from mortarbench.harness.files.reading import (
-    opened,
-    read_json,
-    toml,
-)
+from mortarbench.harness.files.reading import opened, read_json
 from mortarbench.harness.processes.locks import file_lock
 from mortarbench.harness.suite.growth import refuse_changed
-from mortarbench.harness.suite.suite import Suite, SuiteFile, read_stored, suite_file
+from mortarbench.harness.suite.suite import Suite, as_toml, read_suite
 
 #: Folders and files that commands write to a result folder. ``--fresh`` deletes or
 #: overwrites only these and those in `_RESULT_FILES`.
@@ -184,7 +182,7 @@ def claim(
             shutil.rmtree(out / name, ignore_errors=True)
         for name in _RESULT_FILES:
             (out / name).unlink(missing_ok=True)
-    replace_file(out / "suite.toml", suite.text.encode())
+    replace_file(out / "suite.toml", as_toml(to_builtins(suite.file)).encode())
     write_json(out / "environment.json", environment)
 
 
@@ -205,8 +203,7 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> Non
     suite_path, environment_file = out / "suite.toml", out / "environment.json"
     if suite_path.exists():
         try:
-            old, new = read_stored(suite_path), suite_file(toml(suite.text))
-            refuse_changed(old, new, str(suite_path))
+            refuse_changed(read_suite(suite_path), suite.file, str(suite_path))
         except InputError as e:
             raise InputError(f"{e}; {REMEDY}") from None
     if environment_file.exists():
@@ -217,18 +214,6 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> Non
                 f"{out} was measured in another environment ({stored['digest']}, now "
                 f"{environment['digest']}{what and f': {what}'}); {REMEDY}"
             )
-
-
-def suite_of(folder: Path) -> SuiteFile:
-    """Return the suite of a result folder.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, or is not a suite.
-
-    """
-    return read_stored(folder / "suite.toml")
 
 
 def environment_of(folder: Path, digest: str) -> dict[str, Any]:

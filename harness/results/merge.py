@@ -30,13 +30,13 @@ from mortarbench.harness.results.folder import (
 )
 from mortarbench.harness.results.journal import read_journal, refuse_other_solver
 from mortarbench.harness.suite.growth import refuse_unequal
-from mortarbench.harness.suite.suite import read_stored
+from mortarbench.harness.suite.suite import read_suite
 
 
 def merge(
     sources: Sequence[Path], out: Path, tell: Callable[[str], None] = lambda _: None
 ) -> list[Record]:
-    """Merge result folders into a new folder, or into the result of an earlier merge.
+    """Merge result folders into a new folder.
 
     tell : called with messages of one line on repeated measurements and missing files
 
@@ -50,9 +50,9 @@ def merge(
         If a source contains no measurements, or contains a link; if two folders contain
         different records of one measurement, or different solvers under one label; if
         the limits or accuracies of the suites differ; if `out` is a source, lies in a
-        source, or contains a source; if `out` contains results of a run or files of the
-        user; or if the disk is full. In these cases, the journal of `out` does not
-        change.
+        source, or contains a source, or contains measurements or files of the user; or
+        if the disk is full. In these cases, `out` has no
+        journal afterwards.
 
     """
     for source in sources:
@@ -69,28 +69,18 @@ def merge(
                 f"{source}: no measurements; expected a result folder of `run`"
             )
     refuse_foreign(out)
-    journal = out / "journal" / "merged.jsonl"
-    if others := {*journal.parent.glob("*.jsonl")} - {journal}:
+    if journal := next((out / "journal").glob("*.jsonl"), None):
         raise InputError(
-            f"{out} contains measurements of a run (journal/{min(others).name}); "
-            "expected a new folder, or the result of an earlier merge; choose another "
-            "--out"
+            f"{out} contains measurements (journal/{journal.name}); expected a new "
+            "folder; choose another --out"
         )
-    folders = [*[out] * journal.exists(), *journals]
-    _check_labels({f: journals.get(f) or read_journal(f) for f in folders})
-    paths = [path for f in folders if (path := f / "suite.toml").exists()]
-    suites = [read_stored(path) for path in paths]
-    for path, suite_file in zip(paths, suites, strict=True):
-        refuse_unequal(str(paths[0]), suites[0], str(path), suite_file)
-    suite = read_text(paths[0]) if paths else ""
+    _check_labels(journals)
+    paths = [path for folder in journals if (path := folder / "suite.toml").exists()]
+    suites = [read_suite(path) for path in paths]
+    for path, suite in zip(paths, suites, strict=True):
+        refuse_unequal(str(paths[0]), suites[0], str(path), suite)
+    merged = _united(journals, tell)
     with report_full_disk(out), lock_folder(out):
-        merged = _united(
-            {
-                folder: journals.get(folder) or read_journal(folder)
-                for folder in folders
-            },
-            tell,
-        )
         for source, records in journals.items():
             digests = {d for r in records for d in (r.vectors, r.fields) if d}
             missing = [d for d in sorted(digests) if not copy_stored(source, out, d)]
@@ -99,11 +89,11 @@ def merge(
                     f"{source}: {len(missing)} of {len(digests)} solutions are not in "
                     "vectors/"
                 )
-        _copy_environments(folders, out, merged, tell)
-        if suite:  # folders without suites may be merged as well
-            replace_file(out / "suite.toml", suite.encode())
+        _copy_environments([*journals], out, merged, tell)
+        if paths:  # folders without suites may be merged as well
+            replace_file(out / "suite.toml", read_text(paths[0]).encode())
         lines = "".join(f"{r.to_json()}\n" for r in merged)
-        replace_file(journal, lines.encode())
+        replace_file(out / "journal" / "merged.jsonl", lines.encode())
     return merged
 
 

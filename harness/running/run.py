@@ -95,13 +95,13 @@ def run(
     """
     refuse_foreign(out)
     environment = {"digest": digest, **environment}
+    options = {s.label: options_of(resolve(s)) for s in suite.solvers}
     with (
         ended_by_signals(),
         _continuation_told(progress),
         report_full_disk(out),
         lock_folder(out),
     ):
-        options = {s.label: options_of(resolve(s)) for s in suite.solvers}
         past: list[Record] = []
         if not fresh:
             refuse_other(out, suite, environment)
@@ -236,7 +236,7 @@ def _check_same(
         case, such as the digest of its file, has changed.
 
     """
-    cases = {case.name: case.params for case in suite.names}
+    cases = {case.name: case.params for case in suite.cases.all}
     methods = {spec.label: spec.name for spec in suite.solvers}
     configured = {label: finite(plain(value)) for label, value in options.items()}
     for r in past:

@@ -16,7 +16,8 @@ from typing import Any
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.work_unit import WorkUnit
 from mortarbench.harness.running.progress import Progress
-from mortarbench.harness.suite.suite import Group, Suite
+from mortarbench.harness.suite.parameter_grid import Group
+from mortarbench.harness.suite.suite import Suite
 from mortarbench.harness.verify.verdicts import new_record
 
 Cell = tuple[str, str, float]  #: mode, name of the case, and tolerance
@@ -50,14 +51,14 @@ class Schedule:
     @property
     def cells(self) -> int:
         """Largest possible number of measurements of the suite."""
-        s = self.suite
-        return len(s.names) * len(s.tolerances) * s.repeats * len(s.solvers)
+        s, cases = self.suite.file, len(self.suite.cases.all)
+        return cases * len(s.tolerances) * s.repeats * len(self.suite.solvers)
 
     def add(self, record: Record) -> None:
         """Take a measurement in the journal into account.
 
         A solver that hit a limit is not measured on the later cases of a line of the
-        grid (`Suite.lines`) along which the number of variables grew up to this case.
+        grid (`Cases.lines`) along which the number of variables grew up to this case.
         """
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
@@ -66,7 +67,7 @@ class Schedule:
         if record.status is Verdict.DECLINED:
             self._declined.add((record.solver, _cell(record)))
         if record.status in LIMITS and record.mode == "cold":
-            for line in self.suite.lines:
+            for line in self.suite.cases.lines:
                 if record.case not in line[1:]:
                     continue
                 place = line.index(record.case)
@@ -99,8 +100,8 @@ class Schedule:
         Each block is determined when it is requested, so that it takes all measurements
         before it into account.
         """
-        s = self.suite
-        for together in s.groups:
+        s = self.suite.file
+        for together in self.suite.cases.groups:
             for tol, repeat, group in product(s.tolerances, range(s.repeats), together):
                 block = self._block(group, tol, repeat)
                 if block is not None:
@@ -128,7 +129,7 @@ class Schedule:
                     environment=self.environment,
                     session=self.session,
                     mode=group.mode,
-                    accuracy=self.suite.accuracy,
+                    accuracy=self.suite.file.accuracy,
                 )
                 for case in group.cases
             )
@@ -141,7 +142,7 @@ class Schedule:
         # Repeats 2k and 2k + 1 have the same seed, and the second of them reverses the
         # order of the first. All solvers thus have the same mean position in the two
         # repeats.
-        seed = f"{self.suite.name} {group.cases[0]} {tol} {repeat // 2}"
+        seed = f"{self.suite.file.name} {group.cases[0]} {tol} {repeat // 2}"
         random.Random(seed).shuffle(turns)
         if repeat % 2:
             turns.reverse()
@@ -149,8 +150,8 @@ class Schedule:
         return WorkUnit(
             number=turns[0][0].block,
             turns=tuple(turns),
-            time_limit=self.suite.time_limit,
-            memory_limit=self.suite.memory_limit,
+            time_limit=self.suite.file.time_limit,
+            memory_limit=self.suite.file.memory_limit,
         )
 
     def _skip(self, cells: int) -> None:

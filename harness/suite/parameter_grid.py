@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from glob import escape, glob
-from itertools import product
+from itertools import chain, product
 from math import prod
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from msgspec import Meta, Struct
 
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import PLUGINS, InputError, shown, some, unknown
-from mortarbench.harness.names import CaseId, assemble, split_row
+from mortarbench.harness.names import CaseId, assemble, match, parse, split_row
 from mortarbench.harness.plugin import Family
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]+$")]
@@ -34,14 +35,82 @@ class Problem(
     sequence: Text | None = None  #: key whose values are the steps of a sequence
 
 
+class Group(NamedTuple):
+    """The cases of one block: a single case, or the steps of a sequence."""
+
+    cases: tuple[CaseId, ...]
+    mode: str  #: value of `harness.record.Record.mode` for these cases
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cases:
     """All cases of a suite, without duplicates."""
 
     cold: tuple[CaseId, ...]  #: cases solved without results of other cases
-    sequences: tuple[tuple[CaseId, ...], ...]  #: steps of each sequence, in order
+    #: steps of each sequence, in order
+    sequences: tuple[tuple[CaseId, ...], ...] = ()
     #: names of the cold cases along each list of `Problem.params`, in its order
-    lines: tuple[tuple[str, ...], ...]
+    lines: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def groups(self) -> tuple[tuple[Group, ...], ...]:
+        """Groups of cases that form a block: single cases, followed by sequences.
+
+        If the steps of a sequence are also measured cold, they form one cold block, so
+        that both ways differ only in the reuse of results. Their groups stand together,
+        because the blocks of each repeat follow each other.
+        """
+        cold = {case.name for case in self.cold}
+        twice = [s for s in self.sequences if cold.issuperset(c.name for c in s)]
+        steps = {case.name for sequence in twice for case in sequence}
+        return (
+            *((Group((c,), "cold"),) for c in self.cold if c.name not in steps),
+            *(
+                (*[Group(s, "cold")] * (s in twice), Group(s, "sequence"))
+                for s in self.sequences
+            ),
+        )
+
+    @property
+    def all(self) -> tuple[CaseId, ...]:
+        """All cases: single cases, then the steps of each sequence."""
+        groups = chain.from_iterable(self.groups)
+        return tuple(case for group in groups for case in group.cases)
+
+    def selected(
+        self, patterns: Sequence[str], families: Mapping[str, Family]
+    ) -> Cases:
+        """Return the cases that match a pattern, and the sequences with such a case.
+
+        patterns : names of cases, or shell globs over canonical names
+
+        Raises
+        ------
+        InputError
+            If a pattern matches no case.
+
+        """
+        names = [case.name for case in self.all]
+        chosen: set[str] = set()
+        for pattern in patterns:
+            canonical = pattern
+            if not set("*?[") & set(pattern):
+                with suppress(InputError):
+                    canonical = parse(pattern, families).name
+            matches = match(canonical, names)
+            if not matches:
+                raise InputError(
+                    f"cases {pattern!r} matches none of the {len(names)} cases of the "
+                    f"suite; its cases are {some(names)}"
+                )
+            chosen.update(matches)
+        return replace(
+            self,
+            cold=tuple(c for c in self.cold if c.name in chosen),
+            sequences=tuple(
+                s for s in self.sequences if any(c.name in chosen for c in s)
+            ),
+        )
 
 
 def expand_problems(
@@ -199,17 +268,14 @@ def _files(path: str, folder: Path) -> list[str]:
     """
     file, _ = split_row(path)
     row = path.removeprefix(file)
-    if Path(file).is_file():
-        return [path]
-    if (beside := folder / file).is_file():
-        return [f"{os.path.relpath(beside)}{row}"]
+    for base in ("", str(folder)):
+        exact = os.path.join(base, file)
+        pattern = os.path.join(escape(base), file)
+        files = [exact] if os.path.isfile(exact) else sorted(glob(pattern))
+        if files := [f for f in files if os.path.isfile(f)]:
+            return [f"{os.path.relpath(f) if base else f}{row}" for f in files]
     if not set("*?[") & set(path):
         return [path]
-    if here := sorted(filter(os.path.isfile, glob(path))):
-        return here
-    there = glob(os.path.join(escape(str(folder)), path))
-    if files := sorted(map(os.path.relpath, filter(os.path.isfile, there))):
-        return files
     raise InputError(
         f"params.path = {shown(path)} matches no file; expected a pattern relative "
         "to the working directory or to the folder of the suite"

@@ -26,6 +26,7 @@ from mortarbench.harness.plugin import Solver
 from mortarbench.harness.registry import (
     SolverSpec,
     accepts_any,
+    check_name,
     known_options,
     option_types,
     option_value,
@@ -92,24 +93,30 @@ def listed_options(options: object) -> dict[str, list[Any]]:
     return values
 
 
-def typed(spec: SolverSpec, registry: Mapping[str, Solver]) -> SolverSpec:
-    """Convert texts among the options of a solver to the types of the options.
+def selected(
+    specs: Sequence[SolverSpec], names: Sequence[str], solvers: Mapping[str, Solver]
+) -> tuple[SolverSpec, ...]:
+    """Return the solvers with these labels, or with these names in a registry.
+
+    The second copy of a selected solver in an A/A comparison is also returned.
 
     Raises
     ------
     InputError
-        If an option is unknown, or has a value that the solver refuses.
+        If a name is neither a label nor in `solvers`.
 
     """
-    texts = {k: v for k, v in spec.options.items() if isinstance(v, str)}
-    if not texts:
-        return spec
-    plain = replace(
-        spec, options={k: v for k, v in spec.options.items() if k not in texts}
-    )
-    given = {key: [text] for key, text in texts.items()}
-    (variant,) = sweep([plain], given, registry)
-    return replace(variant, label=spec.label)
+    known = {spec.label: spec for spec in specs}
+    for name in names:
+        if name not in known:
+            check_name(name, solvers, labels=known)
+            known[name] = SolverSpec(name=name, label=name)
+    null = [
+        label
+        for label in known
+        if label not in names and label.removesuffix(NULL_SUFFIX) in names
+    ]
+    return tuple(known[name] for name in dict.fromkeys([*names, *null]))
 
 
 def sweep(
@@ -119,9 +126,8 @@ def sweep(
 ) -> tuple[SolverSpec, ...]:
     """Return a variant of each solver for every combination of option values.
 
-    The label of a variant contains its values, as in ``LABEL max_iter=50``. If a solver
-    lacks some of the options, only its existing options are varied. A solver without
-    any of the options is returned unchanged.
+    If a solver lacks some of the options, only its existing options are varied. A
+    solver without any of the options is returned unchanged.
 
     given : values by ``KEY``, or by ``SOLVER.KEY`` for the solvers with this label or
         name
@@ -132,12 +138,10 @@ def sweep(
         If no solver has one of the options, or if a solver refuses a value.
 
     """
-    if not given:
-        return tuple(specs)
     used: set[str] = set()
-    variants: dict[str, SolverSpec] = {}  # by label
+    variants: list[SolverSpec] = []
     with located("--option"):
-        for spec in specs:
+        for spec in specs if given else ():
             configured = resolve(spec, registry)
             axes = {}
             for full, values in given.items():
@@ -148,14 +152,10 @@ def sweep(
                     key in known_options(configured, key)
                     or (is_meant and accepts_any(configured))
                 ):
-                    axes[key] = values
+                    axes[key] = list(values)
                     used.add(full)
-            for variant in with_values(spec, axes, registry):
-                if variant.label in variants:
-                    raise InputError(
-                        f"{variant.label!r} occurs twice; expected distinct values"
-                    )
-                variants[variant.label] = variant
+            options = {**spec.options, **axes}
+            variants += grid(replace(spec, options=options), registry)
         for full in given.keys() - used:
             solver, _, key = full.rpartition(".")
             chosen = [s for s in specs if solver in ("", s.label, s.name)]
@@ -164,13 +164,25 @@ def sweep(
             names = {k for s in chosen for k in known_options(resolve(s, registry))}
             where = solver or (specs[0].name if len(specs) == 1 else "")
             raise unknown("option", key, names, where=where)
-    return tuple(variants.values())
+        return distinct(variants or specs)
+
+
+def distinct(specs: Iterable[SolverSpec]) -> tuple[SolverSpec, ...]:
+    """Return the solvers; raise InputError if two of them have the same label."""
+    labels: dict[str, SolverSpec] = {}
+    for spec in specs:
+        if spec is not labels.setdefault(spec.label, spec):
+            raise InputError(
+                f"label {shown(spec.label)} is used twice; expected different labels"
+            )
+    return tuple(labels.values())
 
 
 def grid(spec: SolverSpec, registry: Mapping[str, Solver]) -> Iterator[SolverSpec]:
     """Yield a variant of a solver for every combination of the lists in its options.
 
     A list spans a grid unless the list is itself a value of the type of the option.
+    The label of a variant contains its values, as in ``LABEL max_iter=50``.
 
     Raises
     ------
@@ -183,18 +195,9 @@ def grid(spec: SolverSpec, registry: Mapping[str, Solver]) -> Iterator[SolverSpe
         key: value
         for key, value in spec.options.items()
         if isinstance(value, list)
-        and key in known_options(solver, key)
+        and (key in known_options(solver, key) or accepts_any(solver))
         and not _is_value(value, solver, key)
     }
-    fixed = {k: v for k, v in spec.options.items() if k not in axes}
-    return with_values(replace(spec, options=fixed), axes, registry)
-
-
-def with_values(
-    spec: SolverSpec, axes: Mapping[str, Sequence[Any]], registry: Mapping[str, Solver]
-) -> Iterator[SolverSpec]:
-    """Yield `spec` with every combination of the values of the options in `axes`."""
-    solver = resolve(spec, registry)
     if (count := prod(map(len, axes.values()))) > _MAX_VARIANTS or not count:
         raise InputError(
             f"options span {count} variants of {spec.name}; expected 1 to "
@@ -203,10 +206,11 @@ def with_values(
     null = NULL_SUFFIX if spec.role == "null" else ""
     for values in product(*axes.values()):
         options = {
-            key: option_value(f"{spec.name}: {key}", value, solver, key, strict=False)
+            key: option_value(f"{spec.name}: {key}", value, solver, key)
             for key, value in zip(axes, values, strict=True)
         }
-        label = f"{with_options(spec.label.removesuffix(null), options)}{null}"
+        texts = [f"{key}={_text(value)}" for key, value in options.items()]
+        label = " ".join([spec.label.removesuffix(null), *texts]) + null
         variant = replace(spec, label=label, options={**spec.options, **options})
         resolve(variant, registry)
         yield variant
@@ -219,16 +223,6 @@ def _is_value(value: object, solver: Solver, key: str) -> bool:
             msgspec.convert(value, kind)
             return True
     return False
-
-
-def with_options(label: str, options: Mapping[str, Any]) -> str:
-    """Append options to the label of a solver.
-
-    >>> with_options("LABEL", {"max_iter": 50, "scaling": True})
-    'LABEL max_iter=50 scaling=true'
-
-    """
-    return " ".join([label, *(f"{k}={_text(v)}" for k, v in options.items())])
 
 
 def _text(value: object) -> str:

@@ -7,9 +7,8 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta, Struct
@@ -17,12 +16,16 @@ from msgspec import Meta, Struct
 from mortarbench.harness.checked import located
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, shown, unknown
-from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, read_toml, toml
-from mortarbench.harness.names import CaseId
+from mortarbench.harness.files.reading import read_toml
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.registry import SolverSpec, in_words, resolve
-from mortarbench.harness.suite.parameter_grid import Problem, Text, expand_problems
-from mortarbench.harness.suite.solver_options import NULL_SUFFIX, grid
+from mortarbench.harness.suite.parameter_grid import (
+    Cases,
+    Problem,
+    Text,
+    expand_problems,
+)
+from mortarbench.harness.suite.solver_options import NULL_SUFFIX, distinct, grid
 
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Fraction = Annotated[float, Meta(gt=0, lt=1)]
@@ -61,13 +64,6 @@ class SuiteFile(
             values = getattr(self, key)
             if len(set(values)) < len(values):
                 raise ValueError(f"{key} = {values}; expected distinct numbers")
-        labels = [spec.label for spec in self.specs()]
-        for label in labels:
-            if labels.count(label) > 1:
-                raise ValueError(
-                    f"solvers: the label {label!r} is used twice; expected different "
-                    "labels"
-                )
 
     def specs(self) -> Iterator[SolverSpec]:
         """Yield the solvers; a list among the options of a solver is not expanded."""
@@ -77,56 +73,13 @@ class SuiteFile(
             yield SolverSpec(name=one.name, label=label, options=one.options)
 
 
-class Group(NamedTuple):
-    """The cases of one block: a single case, or the steps of a sequence."""
-
-    cases: tuple[CaseId, ...]
-    mode: str  #: value of `harness.record.Record.mode` for these cases
-
-
 @dataclass(frozen=True, kw_only=True)
 class Suite:
     """A suite, which specifies a run: every solver on every case at every tolerance."""
 
-    name: str
-    tolerances: tuple[float, ...]
-    repeats: int
-    time_limit: float  #: time limit of a measurement, s
-    memory_limit: float  #: memory limit of a measurement, MiB
+    file: SuiteFile  #: settings of the run, and the entries that are expanded here
     solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
-    cases: tuple[CaseId, ...]  #: distinct cases, solved without results of other cases
-    text: str  #: TOML text of the suite, including the limits that apply
-    #: sequences, each a tuple of its steps in order
-    sequences: tuple[tuple[CaseId, ...], ...] = ()
-    #: names of the cases along each list of a grid
-    lines: tuple[tuple[str, ...], ...] = ()
-    #: tolerance of the verdicts; None for the tolerance that is passed to the solver
-    accuracy: float | None = None
-
-    @property
-    def groups(self) -> tuple[tuple[Group, ...], ...]:
-        """Groups of cases that form a block: single cases, followed by sequences.
-
-        If the steps of a sequence are also measured cold, they form one cold block, so
-        that both ways differ only in the reuse of results. Their groups stand together,
-        because the blocks of each repeat follow each other.
-        """
-        cold = {case.name for case in self.cases}
-        twice = [s for s in self.sequences if cold.issuperset(c.name for c in s)]
-        steps = {case.name for sequence in twice for case in sequence}
-        return (
-            *((Group((c,), "cold"),) for c in self.cases if c.name not in steps),
-            *(
-                (*[Group(s, "cold")] * (s in twice), Group(s, "sequence"))
-                for s in self.sequences
-            ),
-        )
-
-    @property
-    def names(self) -> tuple[CaseId, ...]:
-        """All cases: single cases, then the steps of each sequence."""
-        groups = chain.from_iterable(self.groups)
-        return tuple(case for group in groups for case in group.cases)
+    cases: Cases
 
 
 def load_suite(
@@ -140,20 +93,19 @@ def load_suite(
         If a value is invalid; the message states the file, the key and valid values.
 
     """
-    text = read_text(path, "a TOML file", MAX_TOML_MIB)
-    return parse_suite(text, f"{path}", path.parent, families, solvers)
+    file = read_suite(path)
+    with located(f"{path}"):
+        return expanded(file, path.parent, families, solvers)
 
 
-def parse_suite(
-    text: str,
-    where: str,
+def expanded(
+    file: SuiteFile,
     folder: Path,
     families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
 ) -> Suite:
-    """Parse the TOML of a suite, and check all of its values.
+    """Look up the cases and the solvers of a suite.
 
-    where : origin of the text, for messages
     folder : folder of the suite, see `expand_problems`
 
     Raises
@@ -162,25 +114,11 @@ def parse_suite(
         If a value is invalid; the message states the key and valid values.
 
     """
-    with located(where):
-        file = suite_file(toml(text))
-        for key in ("solvers", "problems"):
-            if not getattr(file, key):
-                raise InputError(f"{key} is missing or empty; expected a list")
-        cases = expand_problems(file.problems, families, folder, file.max_cases)
-        return Suite(
-            name=file.name,
-            tolerances=file.tolerances,
-            repeats=file.repeats,
-            time_limit=file.time_limit,
-            memory_limit=file.memory_limit,
-            accuracy=file.accuracy,
-            text=text,
-            solvers=_solvers(file, solvers),
-            cases=cases.cold,
-            sequences=cases.sequences,
-            lines=cases.lines,
-        )
+    for key in ("solvers", "problems"):
+        if not getattr(file, key):
+            raise InputError(f"{key} is missing or empty; expected a list")
+    cases = expand_problems(file.problems, families, folder, file.max_cases)
+    return Suite(file=file, solvers=_solvers(file, solvers), cases=cases)
 
 
 def suite_file(table: Mapping[str, Any]) -> SuiteFile:
@@ -218,8 +156,8 @@ def suite_file(table: Mapping[str, Any]) -> SuiteFile:
     raise InputError(f"{path} = {shown(value)}; {expected}")
 
 
-def read_stored(path: Path) -> SuiteFile:
-    """Read the suite of a result folder, without looking up its cases and solvers.
+def read_suite(path: Path) -> SuiteFile:
+    """Read a suite from a file, without looking up its cases and solvers.
 
     Raises
     ------
@@ -227,11 +165,9 @@ def read_stored(path: Path) -> SuiteFile:
         If a key or a value is invalid; the message states the file and the value.
 
     """
-    table = read_toml(path, "the suite of a result folder")
-    try:
+    table = read_toml(path)
+    with located(f"{path}"):
         return suite_file(table)
-    except InputError as e:
-        raise InputError(f"{path} is not a suite that a run wrote: {e}") from None
 
 
 def as_toml(table: Mapping[str, Any]) -> str:
@@ -294,30 +230,27 @@ def _solvers(file: SuiteFile, registry: Mapping[str, Solver]) -> tuple[SolverSpe
     A solver that needs the entries of P is returned for a single rank: ranks apply P
     together, but do not assemble it.
     """
-    specs: dict[str, SolverSpec] = {}
+    specs: list[SolverSpec] = []
     counts = [ranks_asked(n, "ranks") for n in file.ranks]
     for number, entry in enumerate(file.specs()):
         with located(f"solvers[{number}]"):
             for spec in grid(entry, registry):
                 able = counts == [1] or _accepts_operators(resolve(spec, registry))
-                for one in map(spec.on, counts if able else [1]):
-                    if one.label in specs:
-                        raise InputError(
-                            f"label {shown(one.label)} is used twice; expected "
-                            "different labels"
-                        )
-                    specs[one.label] = one
-    if max(counts) > 1 and all(spec.ranks == 1 for spec in specs.values()):
+                specs += map(spec.on, counts if able else [1])
+    with located("solvers"):
+        distinct(specs)
+    if max(counts) > 1 and all(spec.ranks == 1 for spec in specs):
         raise InputError(
             f"ranks = {shown(counts)}: every solver needs the entries of P; expected "
             "one that needs products only, or no ranks"
         )
     if file.null_arm is not None:
-        if file.null_arm not in specs:
-            raise unknown("null_arm", file.null_arm, specs)
+        twins = [spec for spec in specs if spec.label == file.null_arm]
+        if not twins:
+            raise unknown("null_arm", file.null_arm, [spec.label for spec in specs])
         label = f"{file.null_arm}{NULL_SUFFIX}"
-        specs[label] = replace(specs[file.null_arm], label=label, role="null")
-    return tuple(specs.values())
+        specs.append(replace(twins[0], label=label, role="null"))
+    return tuple(specs)
 
 
 def _accepts_operators(solver: Solver) -> bool:

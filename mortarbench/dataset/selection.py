@@ -128,12 +128,12 @@ def _items() -> Iterator[Row]:
     """
     registries = Registries()
     suite = load_suite(HERE / CANDIDATES, registries.families, registries.solvers)
-    for case in suite.cases:
+    for case in suite.cases.cold:
         yield _row(case.name, "", OPTIMAL)
     for name in REVERSED_CASES:
         kind = UNBOUNDED if name.endswith("primal") else INFEASIBLE
         yield _row(name, REVERSED, kind)
-    for steps in suite.sequences:
+    for steps in suite.cases.sequences:
         first, last = (case.name.split("/") for case in (steps[0], steps[-1]))
         sequence = _slug(p if p in last else p.partition("=")[0] for p in first)
         key = next(p.partition("=")[0] for p in first if p not in last)

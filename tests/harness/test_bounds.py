@@ -198,7 +198,7 @@ def test_a_grid_beyond_the_limit_is_refused_with_the_way_to_raise_the_limit(tmp_
     with pytest.raises(InputError, match="set max_cases = 3 in the suite"):
         load_suite(path, PROBLEMS, SOLVERS)
     path.write_text(f"max_cases = 3\n{SUITE}{few}")
-    assert len(load_suite(path, PROBLEMS, SOLVERS).names) == 3
+    assert len(load_suite(path, PROBLEMS, SOLVERS).cases.all) == 3
 
 
 @pytest.mark.parametrize(

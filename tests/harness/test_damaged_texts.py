@@ -36,7 +36,7 @@ from mortarbench.harness.suite.solver_options import (
     parse_options,
     sweep,
 )
-from mortarbench.harness.suite.suite import as_toml, load_suite, read_stored
+from mortarbench.harness.suite.suite import as_toml, load_suite, read_suite
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import assemble_stiffness
 from mortarbench.problems.families.description import read_bodies
@@ -208,7 +208,7 @@ def test_a_damaged_suite_of_a_folder_is_refused_or_reported_and_merged(tmp_path,
             shutil.rmtree(tmp_path / "c", ignore_errors=True)
             folders = [tmp_path / "a", tmp_path / "b"]
             if tried(text, lambda f=folders: mb.merge(*f, out=tmp_path / "c")):
-                assert tried(text, lambda: read_stored(tmp_path / "c" / "suite.toml"))
+                assert tried(text, lambda: read_suite(tmp_path / "c" / "suite.toml"))
         suite = tmp_path / "s.toml"
         suite.write_text(SUITE)
         now = load_suite(suite, PROBLEMS, SOLVERS)

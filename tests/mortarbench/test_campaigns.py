@@ -163,18 +163,13 @@ def test_a_change_that_would_mix_two_suites_is_refused(
 def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
     measure("a", depths="1")
     measure("b", depths="2", solvers='"exact", "liar"')
-    again = []
     merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
-    mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all", tell=again.append)
     held = read_journal(tmp_path / "all")
 
     assert held == list(merged.records)
     assert {r.run_id for r in held} == {
         r.run_id for name in "ab" for r in read_journal(tmp_path / name)
     }
-    assert [line.rpartition(": ")[2] for line in again] == [
-        "4 of 4 measurements are already present and are counted once"
-    ] * 2
     assert all(is_stored(tmp_path / "all", r.vectors) for r in held)
     texts = {(tmp_path / name / "suite.toml").read_text() for name in ("a", "all")}
     assert len(texts) == 1
@@ -211,8 +206,6 @@ def test_equal_measurements_of_two_machines_are_kept_and_reported_apart(
         assert [*found.only(environment=digest).answers.repeats] == [2] * 4
     assert "## Answer (one" in page
     assert "## Answer (two" in page
-    mb.merge(tmp_path / "ba", tmp_path / "a", out=tmp_path / "ab")  # nothing new
-    assert read_journal(tmp_path / "ab") == records
 
 
 def test_two_sessions_on_one_machine_are_kept_and_pooled(measure, campaign, tmp_path):
@@ -251,7 +244,10 @@ def renamed(journal, old, new):
             lambda a, b: renamed(b / "journal", '"solver":"lax"', '"solver":"exact"'),
             "b contains exact with name = 'lax', now 'exact'; use a different label",
         ),
-        (lambda a, b: (b / "suite.toml").write_text("solvers = 1\n"), "is not a suite"),
+        (
+            lambda a, b: (b / "suite.toml").write_text("solvers = 1\n"),
+            "solvers = 1; expected",
+        ),
         (lambda a, b: shutil.rmtree(b / "journal"), "no journal in"),
     ],
 )
@@ -269,7 +265,7 @@ def test_incompatible_folders_are_refused_before_anything_is_written(
 def test_the_folder_of_a_run_cannot_be_the_merge_target(stored, tmp_path):
     a, b = stored
     with pytest.raises(
-        mb.InputError, match=r"contains measurements of a run \(journal/"
+        mb.InputError, match=r"contains measurements \(journal/.*; expected a new"
     ):
         mb.merge(a, out=b)
     (tmp_path / "mine").mkdir()
@@ -287,11 +283,9 @@ def test_a_killed_merge_loses_and_duplicates_nothing(stored, tmp_path):
     for instant in range(100):
         out = tmp_path / f"out{instant}"
         ends[instant] = killed_merge([a, b], out, instant)
-        if (out / "journal").exists():
-            with suppress(mb.InputError):
-                assert read_all(mb.load(out)) == whole
-        again = mb.merge(a, b, out=out)
-        assert read_all(again) == read_all(mb.load(out)) == whole
+        if not (out / "journal/merged.jsonl").exists():
+            mb.merge(a, b, out=out)
+        assert read_all(mb.load(out)) == whole
         assert not list(out.rglob("*.tmp"))
         if ends[instant] == 0:
             break

@@ -406,7 +406,7 @@ WRONG = {
     ),
     "pattern of run": (
         ("run", "tiny", "--case", "*/duel"),
-        "the 2 cases of suite 'tiny'; its cases are well/primal, well/dual",
+        "the 2 cases of the suite; its cases are well/primal, well/dual",
     ),
 }
 

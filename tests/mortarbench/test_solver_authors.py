@@ -150,7 +150,7 @@ def test_a_single_solve_accepts_options(cli, versions):
 
     assert codes == [0, 1]
     assert cli(*solve, "--option", "faktor=2")[2] == (
-        "mortarbench: --option: new:mine: unknown option 'faktor'; did you mean "
+        "mortarbench: new:mine: unknown option 'faktor'; did you mean "
         "'factor'? known: factor\n"
     )
 
@@ -219,8 +219,8 @@ def test_a_new_suite_is_one_of_known_solvers_and_cases(starting):
     registries = Registries()
     suite = load_suite(Path("mine.toml"), registries.families, registries.solvers)
 
-    assert suite.name == "mine"
-    assert len(suite.cases) == 4
+    assert suite.file.name == "mine"
+    assert len(suite.cases.cold) == 4
     assert [s.label for s in suite.solvers] == ["smalbe", "osqp", "clarabel-50"]
 
 

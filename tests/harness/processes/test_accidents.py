@@ -32,9 +32,9 @@ from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
-from mortarbench.harness.suite.suite import Suite
 from mortarbench.harness.verify.verdicts import new_record
 from tests.support import ACCIDENTS, ROOT
+from tests.support.suites import suite_of
 from tests.support.waiting import is_alive, soon
 
 PLUGIN = ACCIDENTS
@@ -200,10 +200,9 @@ def test_a_line_other_than_a_reply_to_the_request_is_refused(line):
 
 
 def suite(*solvers, repeats=2):
-    return Suite(
-        name="accidents", tolerances=(1e-6,), repeats=repeats, time_limit=10.0,
-        memory_limit=400.0, cases=(CASE,), text='name = "accidents"\n',
-        solvers=tuple(SolverSpec(name=s, label=s) for s in solvers),
+    return suite_of(
+        *solvers, name="accidents", cases=(CASE,), repeats=repeats, time_limit=10.0,
+        memory_limit=400.0,
     )  # fmt: skip
 
 

@@ -62,26 +62,20 @@ def test_merges_of_overlapping_folders_write_each_measurement_once(session, tmp_
     told = []
 
     merge([tmp_path / "ab", tmp_path / "bc"], tmp_path / "all", told.append)
-    merge([tmp_path / "ab"], tmp_path / "all", told.append)
 
     assert lines(tmp_path / "all") == lines(a) + lines(b) + lines(c)
     assert [line.partition(": ")[2] for line in told] == [
-        f"{n} of 48 measurements are already present and are counted once"
-        for n in (24, 48)
+        "24 of 48 measurements are already present and are counted once"
     ]
 
 
-def test_two_records_of_one_measurement_are_refused_and_nothing_is_lost(
-    session, tmp_path
-):
+def test_two_records_of_one_measurement_are_refused(session, tmp_path):
     a = session("a")
     changed = tmp_path / "changed"
     with Journal(changed, "e") as journal:
         for r in read_journal(a):
             journal.append(r.replace(total_seconds=9.0))
-    merge([a], tmp_path / "out")
-
     with pytest.raises(InputError, match="differs from that of another folder"):
-        merge([changed], tmp_path / "out")
+        merge([a, changed], tmp_path / "out")
 
-    assert lines(tmp_path / "out") == lines(a)
+    assert not (tmp_path / "out").exists()

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,12 +20,12 @@ from mortarbench.harness.files.store import load_fields, load_solution
 from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import measurement as remote
 from mortarbench.harness.processes import supervisor
-from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
+from mortarbench.harness.registry import load_plugin, resolve
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
-from mortarbench.harness.suite.suite import Suite
 from tests.support import ADVERSARIES
+from tests.support.suites import suite_of
 
 PLUGIN = ADVERSARIES
 START = [sys.executable, "-P", str(PLUGIN)]
@@ -67,19 +66,8 @@ class Watcher:
 
 
 def suite(*solvers, cases=({},), **changes):
-    fixed = Suite(
-        name="test",
-        tolerances=(1e-6,),
-        repeats=1,
-        time_limit=30.0,
-        memory_limit=2000.0,
-        solvers=tuple(SolverSpec(name=s, label=s) for s in solvers),
-        cases=tuple(
-            assemble("tiny", FAMILIES["tiny"], case, "plain") for case in cases
-        ),
-        text='name = "test"\n',
-    )
-    return replace(fixed, **changes)
+    cold = [assemble("tiny", FAMILIES["tiny"], case, "plain") for case in cases]
+    return suite_of(*solvers, cases=cold, **{"time_limit": 30.0} | changes)
 
 
 @pytest.fixture
@@ -227,11 +215,11 @@ def test_a_record_contains_times_of_phases_threads_and_cpu(measure, tmp_path):
     assert quick.peak_mib == max(peaks) > 10
 
 
-def three_steps(*solvers, **changes):
+def three_steps(*solvers, cases=(), **changes):
     names = [
         assemble("tiny", FAMILIES["tiny"], {"h": h}, "plain") for h in (0.5, 1.0, 1.5)
     ]
-    return suite(*solvers, cases=(), sequences=(tuple(names),), **changes)
+    return suite(*solvers, cases=cases, sequences=(tuple(names),), **changes)
 
 
 def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
@@ -250,8 +238,8 @@ def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
 
 
 def test_steps_listed_both_ways_are_solved_once_each_cold_and_warm(measure, tmp_path):
-    asked = three_steps("chains", "honest", repeats=2)
-    measure(replace(asked, cases=asked.sequences[0]))
+    cold = [{"h": h} for h in (0.5, 1.0, 1.5)]
+    measure(three_steps("chains", "honest", cases=cold, repeats=2))
     records = read_journal(tmp_path)
 
     assert len(records) == 2 * 2 * 2 * 3
@@ -347,7 +335,7 @@ def test_another_suite_or_environment_is_refused_unless_fresh(measure, tmp_path)
     (tmp_path / "validation.json").write_text("{}")  # a result of `validate`
     (tmp_path / "report").mkdir()
 
-    other = suite("zero", text='name = "other"\n')
+    other = suite("zero", name="other")
     with pytest.raises(InputError, match=r"'test' in .*, 'other' in .* --fresh"):
         measure(other)
     with pytest.raises(InputError, match=r"another environment \(here, now there\)"):

@@ -1,7 +1,7 @@
 """Schedule of blocks: order and resumption."""
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import pytest
@@ -9,9 +9,8 @@ import pytest
 from mortarbench.harness import Verdict
 from mortarbench.harness.names import assemble
 from mortarbench.harness.plugin import Family
-from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.running.schedule import Schedule
-from mortarbench.harness.suite.suite import Suite
+from tests.support.suites import suite_of
 
 
 @dataclass(frozen=True)
@@ -39,16 +38,14 @@ class Quiet:
         self.said.append(text)
 
 
-def schedule_of(**changes):
+def schedule_of(*solvers, **changes):
     """Return a schedule of one case, three repeats and solvers a and b; `changes`
-    replaces fields of its suite.
+    replaces parts of its suite.
     """
-    suite = Suite(
-        name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
-        solvers=tuple(SolverSpec(name=s, label=s) for s in "ab"),
-        cases=cases_of(1), text="",
-    )  # fmt: skip
-    suite = replace(suite, **changes)
+    suite = suite_of(
+        *(solvers or "ab"),
+        **{"name": "s", "repeats": 3, "cases": cases_of(1)} | changes,
+    )
     return Schedule(
         suite=suite, environment="e", progress=Quiet(),
         options={s.label: {} for s in suite.solvers},
@@ -57,8 +54,7 @@ def schedule_of(**changes):
 
 def test_the_order_of_a_block_is_reversed_in_the_next():
     """Mean positions of solvers are equal; pairs of blocks have random orders."""
-    solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
-    blocks = list(schedule_of(solvers=solvers, repeats=6).blocks())
+    blocks = list(schedule_of(*"abcdef", repeats=6).blocks())
     orders = ["".join(turn[0].solver for turn in b.turns) for b in blocks]
 
     assert [order[::-1] for order in orders[::2]] == orders[1::2]

@@ -1,7 +1,6 @@
 """Suites: content of their TOML, and messages for mistakes."""
 
 import re
-import tomllib
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
@@ -12,7 +11,7 @@ from mortarbench import problems, solvers
 from mortarbench.harness import InputError, Range
 from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
-from mortarbench.harness.suite.overrides import with_overrides
+from mortarbench.harness.suite.solver_options import selected
 from mortarbench.harness.suite.suite import load_suite
 from tests.support import ROOT
 
@@ -74,7 +73,7 @@ def load(tmp_path):
 
 
 def names(suite):
-    return [case.name for case in suite.cases]
+    return [case.name for case in suite.cases.cold]
 
 
 def test_a_suite_contains_the_values_of_the_file(load):
@@ -94,8 +93,9 @@ def test_a_suite_contains_the_values_of_the_file(load):
         """
     )
 
-    assert suite.tolerances == (1e-3, 1e-9)
-    assert (suite.repeats, suite.time_limit, suite.memory_limit) == (7, 0.5, 100.0)
+    file = suite.file
+    assert file.tolerances == (1e-3, 1e-9)
+    assert (file.repeats, file.time_limit, file.memory_limit) == (7, 0.5, 100.0)
     assert suite.solvers[1] == SolverSpec(
         name="clarabel", label="patient", options={"max_iter": 5}
     )
@@ -107,10 +107,10 @@ def test_lists_span_a_grid_with_the_first_key_slowest(load):
         MINIMAL + 'forms = ["dual"]\nparams = { m = [2, 3], kind = "hard", n = [4, 5] }'
     )
 
-    assert [(c.params["m"], c.params["n"]) for c in suite.cases] == [
+    assert [(c.params["m"], c.params["n"]) for c in suite.cases.cold] == [
         (2, 4), (2, 5), (3, 4), (3, 5)
     ]  # fmt: skip
-    assert {c.params["kind"] for c in suite.cases} == {"hard"}
+    assert {c.params["kind"] for c in suite.cases.cold} == {"hard"}
 
 
 def test_zipped_lists_vary_together_at_the_position_of_the_first(load):
@@ -120,7 +120,7 @@ def test_zipped_lists_vary_together_at_the_position_of_the_first(load):
         + 'params = { n = [2, 3], kind = ["soft", "hard"], m = [8, 9] }'
     )
 
-    assert [tuple(c.params.values()) for c in suite.cases] == [
+    assert [tuple(c.params.values()) for c in suite.cases.cold] == [
         (2, 8, "soft"), (2, 8, "hard"), (3, 9, "soft"), (3, 9, "hard")
     ]  # fmt: skip
 
@@ -196,7 +196,7 @@ def test_mistakes_are_reported_with_file_place_and_remedy(
         ("{ label = 'a' }", "solvers[1]: name is missing"),
         (
             "'osqp'",
-            "solvers: the label 'osqp' is used twice; expected different labels",
+            "solvers: label 'osqp' is used twice; expected different labels",
         ),
         (
             "{ name = 'clarabel', options = { max_itr = 9 } }",
@@ -225,57 +225,37 @@ def test_malformed_toml_is_named_by_line(load, text, message):
 
 
 @pytest.fixture
-def narrowed(load):
-    suite = load(
-        "time_limit = 9\nname = 'demo'\n"
+def demo(load):
+    return load(
+        "name = 'demo'\n"
         "solvers = ['osqp', { name = 'clarabel', label = 'patient' }]\n"
         "[[problems]]\nfamily = 'well'\nparams = { n = [2, 12] }\n"
     )
-    return lambda **changes: with_overrides(suite, FAMILIES, SOLVERS, **changes)
 
 
-def test_solvers_are_chosen_by_label_or_added_by_name(narrowed):
-    chosen = narrowed(solvers=["other", "patient", "other"]).solvers
+def test_solvers_are_chosen_by_label_or_added_by_name(demo):
+    chosen = selected(demo.solvers, ["other", "patient", "other"], SOLVERS)
 
     assert [(s.name, s.label) for s in chosen] == [
         ("other", "other"), ("clarabel", "patient")
     ]  # fmt: skip
+    with pytest.raises(InputError, match="unknown solver 'patent'; did you mean 'p"):
+        selected(demo.solvers, ["patent"], SOLVERS)
 
 
-def test_patterns_choose_cases_in_the_suite_s_order(narrowed):
-    chosen = narrowed(cases=["*/n=12/*", "well/n=2/dual", "*/n=12/dual"])
+def test_patterns_choose_cases_in_the_suite_s_order(demo):
+    patterns = ["*/n=12/*", "well/n=2/dual", "*/n=12/dual"]
+    chosen = demo.cases.selected(patterns, FAMILIES).cold
 
-    assert names(chosen) == ["well/n=2/dual", "well/n=12/primal", "well/n=12/dual"]
-
-
-def test_only_limits_change_the_text_of_a_suite(narrowed):
-    before = narrowed()
-    after = narrowed(time_limit=2.5, memory_limit=100, repeats=1, cases=["*/dual"])
-
-    assert (after.time_limit, after.memory_limit, after.repeats) == (2.5, 100, 1)
-    assert tomllib.loads(after.text) == tomllib.loads(before.text) | {
-        "time_limit": 2.5, "memory_limit": 100
-    }  # fmt: skip
-    assert narrowed(repeats=1, solvers=["osqp"]).text == before.text
+    assert [case.name for case in chosen] == [
+        "well/n=2/dual", "well/n=12/primal", "well/n=12/dual"
+    ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            dict(solvers=["patent"]),
-            "--solver: unknown solver 'patent'; did you mean 'p",
-        ),
-        (dict(cases=["well"]), "--case 'well' matches none of the 4 cases of suite 'd"),
-        (dict(cases=["*", "x*"]), "--case 'x.' matches none of the 4 cases of suite"),
-        (dict(repeats=0), "--repeats = 0; expected an integer of at least 1"),
-        (dict(time_limit=0.0), "--time-limit = 0.0; expected a positive number"),
-        (dict(memory_limit=-1.0), "--memory-limit = -1.0; expected a positive number"),
-    ],
-)
-def test_an_invalid_override_is_refused(narrowed, changes, message):
-    with pytest.raises(InputError, match=message):
-        narrowed(**changes)
+@pytest.mark.parametrize("pattern", ["well", "x*"])
+def test_a_pattern_without_cases_is_refused(demo, pattern):
+    with pytest.raises(InputError, match="matches none of the 4 cases of the suite"):
+        demo.cases.selected(["*", pattern], FAMILIES)
 
 
 def shipped(name):
@@ -298,7 +278,8 @@ def patterned(folder, path):
     )
     families = {"stored": Stored()}
     return [
-        c.params["path"] for c in load_suite(folder / "s.toml", families, SOLVERS).cases
+        c.params["path"]
+        for c in load_suite(folder / "s.toml", families, SOLVERS).cases.cold
     ]
 
 
@@ -339,9 +320,9 @@ def test_a_pattern_without_files_is_refused(tmp_path, monkeypatch):
 
 
 def test_a_sequence_may_run_along_zipped_keys():
-    paths = shipped("finite-strain")
+    paths = shipped("finite-strain").cases
 
-    assert len(paths.cases) == 80
+    assert len(paths.cold) == 80
     assert [
         [(c.params["step"], c.params["newton"]) for c in s] for s in paths.sequences
     ] == [[(step, newton) for step in range(1, 11) for newton in range(1, 5)]] * 2
@@ -366,9 +347,9 @@ def test_lines_of_a_grid_differ_in_one_list_only(load):
     soft = tuple(f"well/n={n}/dual" for n in (2, 4, 8))
     hard = tuple(f"well/n={n}/kind=hard/dual" for n in (2, 4, 8))
 
-    assert {soft, hard} < set(suite.lines)
-    assert set(suite.lines) - {soft, hard} == set(zip(soft, hard, strict=True))
-    assert load(MINIMAL).lines == ()
+    assert {soft, hard} < set(suite.cases.lines)
+    assert set(suite.cases.lines) - {soft, hard} == set(zip(soft, hard, strict=True))
+    assert load(MINIMAL).cases.lines == ()
 
 
 def test_files_in_a_list_are_no_series_of_growing_problems(tmp_path):
@@ -382,8 +363,8 @@ def test_files_in_a_list_are_no_series_of_growing_problems(tmp_path):
     )
     suite = load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
 
-    assert len(suite.cases) == 2
-    assert suite.lines == ()
+    assert len(suite.cases.cold) == 2
+    assert suite.cases.lines == ()
 
 
 def test_a_list_among_the_options_spans_a_grid_of_labelled_solvers(load):

@@ -310,7 +310,7 @@ def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
     """Energies of primal and dual solutions, verified at tol 1e-8, agree to 1e-6."""
     suite = load_suite(suites_folder() / "demo.toml", PROBLEMS, SOLVERS)
     energies = {}
-    for name in (case for case in suite.cases if case.family_name == "beam-ring"):
+    for name in (case for case in suite.cases.cold if case.family_name == "beam-ring"):
         case = name.build(reference_solution)
         for solver in (SMALBE(), Clarabel()):
             if not solver.declines(case.qp):
