@@ -132,10 +132,10 @@ def test_the_linearised_gap_is_exact_to_first_order():
 
 @pytest.mark.parametrize("fixed", [None, np.array([0, 2])])
 def test_the_geometric_stiffness_is_the_derivative_of_the_forces(fixed):
-    """Central differences of Bᵀλ, at nodes above the segments 1 and 2 (of 4)."""
+    """Central differences of Bᵀλ, at nodes above the segment 1 and below 2 (of 4)."""
     rng = np.random.default_rng(4)
     master = np.column_stack([[4.0, 2.5, 2, 1, 0], [0.0, 0.1, 0.1, -0.2, 0.0]])
-    points = np.concatenate([[[2.3, 0.3], [1.4, 0.2]], master])
+    points = np.concatenate([[[2.3, 0.3], [1.4, -0.2]], master])
     u, force = 0.02 * rng.standard_normal(14), np.array([3.0, 2.0])
     sides, step = (np.arange(2), np.arange(2, 7)), 1e-6
 

@@ -1,7 +1,5 @@
 """The cantilever at finite strain: elastica, convergence, rejected keys."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -9,12 +7,10 @@ from scipy.optimize import brentq
 
 import mortarbench as mb
 from mortarbench.harness import InputError, no_rows
-from mortarbench.problems.contact.bodies import assemble, factorise_clamped
+from mortarbench.problems.contact.bodies import factorise_clamped
 from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality.newton_case import newton_path
 from mortarbench.problems.families.cantilever import beam, elastica
-from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import dofs_of, rectangle
 
 
 @pytest.mark.parametrize(
@@ -51,7 +47,7 @@ def emitted(name):
     ("load", "ny"), [pytest.param(1, 8, marks=pytest.mark.slow), (10, 4)]
 )
 def test_the_tip_of_a_slender_beam_agrees_with_the_elastica(load, ny):
-    case, answer = emitted(f"cantilever/load={load}/ny={ny}/dual")
+    _, answer = emitted(f"cantilever/load={load}/ny={ny}/dual")
 
     assert answer.verdict == "verified"
     values = answer.quantities
@@ -60,11 +56,6 @@ def test_the_tip_of_a_slender_beam_agrees_with_the_elastica(load, ny):
     assert values["clipped_in_step"] == 0
     assert values["load_parts"] == 1
     assert values["residual"] < 1e-8
-    # at convergence, the quadratic model equals the potential
-    s = answer.solution
-    emitted_case = case.family_case
-    objective = emitted_case.scale * case.qp.objective(s.x) + emitted_case.constant
-    assert objective == pytest.approx(values["energy"], rel=1e-9)
 
 
 @pytest.mark.parametrize("material", ["neo-hooke", "svk"])
@@ -139,24 +130,6 @@ def test_all_forms_define_the_same_iteration():
         mb.build("cantilever/slenderness=4/ny=2/load=2/newton=99/primal")
 
 
-@pytest.mark.parametrize(
-    "newton", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 3))]
-)
-def test_iterations_are_verified_by_smalbe_and_three_generic_solvers(newton):
-    name = f"cantilever/slenderness=4/ny=2/load=2/newton={newton}"
-    cases = {form: mb.build(f"{name}/{form}") for form in ("primal", "dual")}
-    ends = []
-    for solver, form in (
-        ("smalbe", "dual"), ("clarabel", "primal"), ("proxqp", "primal"),
-        ("osqp", "dual"),
-    ):  # fmt: skip
-        answer = mb.solve(cases[form], solver, tol=1e-8)
-        assert answer.verdict == "verified"
-        ends.append(answer.quantities["deflection"])
-
-    assert np.ptp(ends) < 1e-6 * max(ends)
-
-
 def test_for_small_loads_finite_and_linear_displacements_differ_by_their_square():
     differences = []
     for load in (0.02, 0.01):
@@ -174,29 +147,6 @@ def no_contact(bodies):
         no_rows(n), np.zeros(0), no_rows(n), none, np.zeros(0), none, np.zeros(0), none
     )
     return lambda u: rows
-
-
-@pytest.mark.parametrize("material", ["neo-hooke", "svk"])
-def test_a_rotated_problem_has_the_rotated_answer(material):
-    Q = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
-    answers = []
-    for turn in (np.eye(2), Q):
-        mesh = rectangle((0.0, -0.1), (1.0, 0.2), (10, 2))
-        mesh = replace(mesh, points=mesh.points @ turn.T)
-        load = np.zeros((len(mesh.points), 2))
-        load[mesh.boundaries["right"]] = turn @ [0.002, -0.003]
-        bodies = assemble(
-            mesh, np.zeros(20, dtype=np.int64), names=("beam",),
-            materials=(Material(1.0, 0.3),), plane="strain", units=(1.0, 0.01),
-            fixed=dofs_of(mesh.boundaries["left"], 2), load=load.ravel(), pairs=(),
-        )  # fmt: skip
-        path = newton_path(bodies, no_contact(bodies), None, material=material)
-        answers.append(path.iteration(1).answer.x.reshape(-1, 2))
-
-    straight, turned = answers
-
-    assert np.abs(straight).max() > 0.3
-    assert np.abs(turned - straight @ Q.T).max() < 1e-10
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import spsolve
-from skfem import Basis, ElementHex1, ElementQuad1, ElementVector, MeshHex, MeshQuad
+from skfem import Basis, ElementQuad1, ElementVector, MeshQuad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from mortarbench.problems.fem.elasticity import (
@@ -16,9 +16,8 @@ from mortarbench.problems.fem.elasticity import (
     stiffness,
     strain_matrix,
 )
-from mortarbench.problems.fem.elements import HEXAHEDRON, QUAD
+from mortarbench.problems.fem.elements import QUAD
 from mortarbench.problems.fem.mesh import (
-    Mesh,
     as_vectors,
     boundary_facets,
     box,
@@ -73,84 +72,10 @@ def test_plane_strain_stiffness_equals_an_independent_code(mesh):
     assert abs(K - expected).max() <= 1e-13 * abs(expected).max()
 
 
-def bricks(n, amplitude=0.05):
-    """Return the unit cube of n³ hexahedra, smoothly distorted."""
-    i = np.arange((n + 1) ** 3).reshape(n + 1, n + 1, n + 1)
-    corners = (HEXAHEDRON.corners + 1) // 2
-    at = [i[x : x + n, y : y + n, z : z + n].ravel() for x, y, z in corners]
-    points = np.array(list(np.ndindex(n + 1, n + 1, n + 1))) / n
-    bump = amplitude * np.prod(np.sin(np.pi * points), axis=1)
-    return Mesh(points + bump[:, None] * [1, 0.7, -0.4], np.stack(at, axis=-1), {})
-
-
-def test_stiffness_of_hexahedra_equals_an_independent_code():
-    mesh = bricks(3)
-    theirs = MeshHex().p  # corners of scikit-fem, in [0, 1]³
-    ours = (HEXAHEDRON.corners + 1) / 2
-    order = [int((ours == corner).all(axis=1).argmax()) for corner in theirs.T]
-    reference = Basis(
-        MeshHex(mesh.points.T.copy(), mesh.cells[:, order].T.copy()),
-        ElementVector(ElementHex1()), intorder=2,
-    )  # fmt: skip
-    expected = linear_elasticity(*lame_parameters(STEEL.E, STEEL.nu)).assemble(
-        reference
-    )
-
-    K = stiffness(mesh, elasticity_matrix(STEEL, None))
-
-    assert abs(K - expected).max() <= 1e-13 * abs(expected).max()
-    assert [block.kind for block in mesh.blocks] == ["hexahedron"]
-
-
-def test_stiffness_of_one_hexahedron_equals_quadrature_by_hand():
-    rng = np.random.default_rng(20)
-    one = bricks(1)
-    mesh = Mesh(one.points + rng.uniform(-0.15, 0.15, (8, 3)), one.cells, {})
-    D, x = elasticity_matrix(STEEL, None), mesh.points[mesh.cells[0]]
-    expected = np.zeros((24, 24))
-    for at in HEXAHEDRON.corners / np.sqrt(3):
-        step = 1e-30j  # complex step: no cancellation
-        moved = at + step * np.eye(3)
-        N = np.prod(1 + HEXAHEDRON.corners * moved[:, None], axis=2) / 8  # (3, 8)
-        dN = N.imag / step.imag
-        J = dN @ x
-        B = np.zeros((6, 24))
-        dx, dy, dz = np.linalg.solve(J, dN)
-        B[0, 0::3], B[1, 1::3], B[2, 2::3] = dx, dy, dz
-        B[3, 1::3], B[3, 2::3] = dz, dy
-        B[4, 0::3], B[4, 2::3] = dz, dx
-        B[5, 0::3], B[5, 1::3] = dy, dx
-        expected += B.T @ D @ B * np.linalg.det(J)
-
-    at = dofs_of(mesh.cells[0], 3)
-    K = stiffness(mesh, D).toarray()[np.ix_(at, at)]
-
-    np.testing.assert_allclose(K, expected, rtol=0, atol=1e-13 * abs(expected).max())
-    sizes = np.linalg.eigvalsh(K)
-    assert (abs(sizes[:6]) <= 1e-14 * sizes[-1]).all()
-    assert sizes[6] > 1e-3 * sizes[-1]
-
-
-def test_linear_displacements_of_hexahedra_have_their_constant_stress():
-    mesh, gradient = bricks(4), np.arange(9).reshape(3, 3) / 7 - 0.4
-    D = elasticity_matrix(STEEL, None)
-    u = (mesh.points @ gradient.T).ravel()
-    e = (gradient + gradient.T) / 2
-    strain = [*np.diag(e), 2 * e[1, 2], 2 * e[0, 2], 2 * e[0, 1]]
-
-    stress = centre_stress(mesh, D, u)
-
-    np.testing.assert_allclose(stress, np.tile(D @ strain, (64, 1)), rtol=1e-11)
-    forces = as_vectors(stiffness(mesh, D) @ u, 3)
-    interior = (np.abs(mesh.points - 0.5) < 0.49).all(axis=1)
-    assert interior.sum() == 27
-    assert abs(forces[interior]).max() <= 1e-13 * abs(forces).max()
-
-
 @pytest.mark.parametrize(
     ("points", "modes"),
     [
-        (bricks(2).points, 6),
+        (bent(box((0, 0, 0), (1, 1, 1), (2, 2, 2))).points, 6),
         (distorted(3).points, 3),
         (np.linspace(0, 1, 5)[:, None], 1),
     ],
@@ -167,25 +92,6 @@ def test_rigid_modes_of_any_dimension_are_orthonormal_rigid_motions(points, mode
         v = as_vectors(mode, dim)
         change = np.einsum("abx,abx->ab", apart, v[:, None] - v)
         assert abs(change).max() <= 1e-14
-
-
-def test_facets_of_hexahedra_enclose_the_body_anticlockwise_from_outside():
-    mesh = bricks(3, amplitude=0)
-    facets = boundary_facets(mesh.cells, mesh.dim)
-
-    assert len({tuple(sorted(facet)) for facet in facets.tolist()}) == 6 * 9
-    a, b, c, d = np.moveaxis(mesh.points[facets], 1, 0)
-    area = np.cross(c - a, d - b) / 2
-    outwards = (a + c) / 2 - 0.5
-    np.testing.assert_allclose(np.linalg.norm(area, axis=1), 1 / 9)
-    np.testing.assert_allclose(np.einsum("fx,fx->f", area, outwards), 1 / 18)
-
-
-def test_rigid_motions_of_hexahedra_have_no_energy():
-    mesh = bricks(3)
-    K, R = stiffness(mesh, elasticity_matrix(STEEL, None)), rigid_modes(mesh.points)
-
-    assert abs(K @ R).max() <= 1e-13 * abs(K).max()
 
 
 @pytest.mark.parametrize("plane", ["strain", "stress"])
@@ -223,28 +129,6 @@ def test_a_linear_displacement_has_its_exact_stress_and_no_inner_force(plane):
 
     assert stress == pytest.approx(np.tile([sx, sy, shear], (len(mesh.points), 1)))
     assert abs(force[inner]).max() <= 1e-10 * abs(force).max()
-
-
-def test_recovered_stress_converges_with_second_order_up_to_the_boundary():
-    """The displacement u = (sin 2x cos y, x² y) is interpolated on smoothly distorted
-    meshes."""
-    D = elasticity_matrix(Material(E=1.0, nu=0.3), "strain")
-    errors = []
-    for n in (16, 32, 64):
-        mesh = distorted(n)
-        x, y = mesh.points.T
-        u = np.column_stack([np.sin(2 * x) * np.cos(y), x**2 * y]).ravel()
-        strain = np.column_stack(
-            [
-                2 * np.cos(2 * x) * np.cos(y),
-                x**2,
-                -np.sin(2 * x) * np.sin(y) + 2 * x * y,
-            ]
-        )
-        error = recover(mesh, centre_stress(mesh, D, u)) - strain @ D
-        errors.append(abs(error).max())
-
-    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(2, abs=0.25)
 
 
 def test_recovered_stress_of_a_finite_element_solution_has_rate_two():
