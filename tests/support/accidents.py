@@ -26,7 +26,7 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from adversaries import PROBLEMS, Honest, at_the_row
+from adversaries import PROBLEMS, Honest, at_the_row, unsolved
 
 from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.parent import descendants
@@ -213,16 +213,6 @@ def spin(seconds):
         pass
 
 
-class Computes(Honest):
-    """Correct solver that computes for some milliseconds."""
-
-    def act(self, qp):
-        matrix, vector = np.ones((200, 200)), np.ones(200)
-        for _ in range(1000):
-            matrix @ vector
-        return at_the_row(qp)
-
-
 class PatchesTheClock(Honest):
     """Solver that works for 2 ms with a clock that adds 1 s per call, as in tests."""
 
@@ -250,32 +240,6 @@ class OnAll(Honest):
         return replace(
             at_the_row(qp), z=-gradient[:1], z_box=np.array([0.0, -gradient[1]])
         )
-
-
-class Remembers(OnAll):
-    """Solver that works for 16 ms once per QP, and later returns a cached answer."""
-
-    known: ClassVar[dict] = {}
-
-    def act(self, qp):
-        key = qp.q.tobytes()
-        if key not in self.known:
-            spin(0.016)
-            self.known[key] = self.at_the_row(qp)
-        return self.known[key]
-
-
-class Compiles(OnAll):
-    """Solver that works for 0.3 s in the first solve of each shape, as JAX does."""
-
-    shapes: ClassVar[set] = set()
-
-    def act(self, qp):
-        if qp.P.shape not in self.shapes:
-            spin(0.3)
-            self.shapes.add(qp.P.shape)
-        spin(0.0005)
-        return self.at_the_row(qp)
 
 
 class DiesOnOthers(OnAll):
@@ -332,11 +296,6 @@ class ClosesAll(Honest):
     def act(self, qp):
         os.closerange(3, 256)
         return at_the_row(qp)
-
-
-def unsolved(qp):
-    """Raise ArithmeticError: without a reference solution, residuals decide."""
-    raise ArithmeticError("no reference solve")
 
 
 SOLVERS = {

@@ -200,32 +200,11 @@ class WrongSign(Honest):
         return replace(s, z=-s.z)
 
 
-class AnswersAnotherProblem(Honest):
-    """Solver that returns the answer to the first problem for all problems."""
-
-    first = None
-
-    def act(self, qp):
-        if AnswersAnotherProblem.first is None:
-            AnswersAnotherProblem.first = at_the_row(qp)
-        return AnswersAnotherProblem.first
-
-
 class Sleeps(Honest):
     """Solver that sleeps for 20 ms."""
 
     def act(self, qp):
         time.sleep(0.02)
-        return at_the_row(qp)
-
-
-class Products(Honest):
-    """Solver that computes for some milliseconds."""
-
-    def act(self, qp):
-        matrix, vector = np.ones((200, 200)), np.ones(200)
-        for _ in range(1000):
-            matrix @ vector
         return at_the_row(qp)
 
 
@@ -239,19 +218,6 @@ class Chains(Honest):
         def prepare(qp):
             seen.append(qp)
             return lambda: replace(at_the_row(qp), iterations=len(seen))
-
-        return prepare
-
-
-class BreaksItsChain(Honest):
-    """Solver whose process ends at the second QP of a sequence."""
-
-    def chain(self, tol):
-        seen = []
-
-        def prepare(qp):
-            seen.append(qp)
-            return lambda: os._exit(9) if len(seen) == 2 else at_the_row(qp)
 
         return prepare
 

@@ -16,11 +16,9 @@ from mortarbench.harness.files.matfile import save_mat
 from mortarbench.harness.files.parquetfile import save_parquet
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.problems.files.fclib import read_fclib
 from tests.support.bounded import bounded
 from tests.support.box_stack import local_arrays, write_boxes, write_datasets
-from tests.support.mesh_formats import write_inp, write_med
 
 EXTREMES = (
     0, 1, -1, 2**15, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**63 - 1, -(2**63),
@@ -133,114 +131,12 @@ def seeds(folder):
     written("hdf5", lambda path: write_boxes(path, 1))
     one = local_arrays(np.eye(3), np.ones(3), np.ones(1))
     written("hdf5", lambda path: write_datasets(path, one))
-    found["msh"] = [msh_22(), *meshes(folder)]
-    (folder / "text.msh").write_bytes(msh_22())
-    for kind, write in (("inp", write_inp), ("med", write_med)):
-        write(folder / "text.msh", folder / f"seed.{kind}")
-        found[kind] = [(folder / f"seed.{kind}").read_bytes()]
-    found["inp"].append(INP)
     return found
 
 
 def repacked(path, compression):
     """Rewrite a Parquet file with another compression."""
     pq.write_table(pq.ParquetFile(path).read(), path, compression=compression)
-
-
-def msh_22():
-    """Return a mesh of two quadrilaterals and an edge in the ASCII format 2.2."""
-    points = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]
-    nodes = "\n".join(f"{i} {x} {y} 0" for i, (x, y) in enumerate(points, 1))
-    return f"""$MeshFormat
-2.2 0 8
-$EndMeshFormat
-$PhysicalNames
-2
-1 1 "side"
-2 2 "body"
-$EndPhysicalNames
-$Nodes
-6
-{nodes}
-$EndNodes
-$Elements
-3
-1 1 2 1 1 1 2
-2 3 2 2 1 1 2 5 4
-3 3 2 2 1 2 3 6 5
-$EndElements
-""".encode()
-
-
-def meshes(folder):
-    """Yield a mesh in format 2.2, as text and as binary data, and in format 4.1."""
-    import meshio
-
-    (folder / "text.msh").write_bytes(msh_22())
-    mesh = meshio.gmsh.read(folder / "text.msh")
-    for binary in (False, True):
-        path = folder / f"{binary}.msh"
-        meshio.gmsh.write(path, mesh, fmt_version="2.2", binary=binary)
-        yield path.read_bytes()
-    yield MSH_41
-
-
-MSH_41 = b"""$MeshFormat
-4.1 0 8
-$EndMeshFormat
-$PhysicalNames
-2
-1 1 "side"
-2 2 "body"
-$EndPhysicalNames
-$Entities
-0 1 1 0
-1 0 0 0 1 0 0 1 1 0
-1 0 0 0 2 1 0 1 2 0
-$EndEntities
-$Nodes
-1 6 1 6
-2 1 0 6
-1
-2
-3
-4
-5
-6
-0 0 0
-1 0 0
-2 0 0
-0 1 0
-1 1 0
-2 1 0
-$EndNodes
-$Elements
-2 3 1 3
-1 1 1 1
-1 1 2
-2 1 3 2
-2 1 2 5 4
-3 2 3 6 5
-$EndElements
-"""
-
-INP = b"""*NODE, NSET=all
-1, 0, 0, 0
-2, 1, 0, 0
-3, 0, 1, 0
-4, 0, 0, 1
-5, 0, 0, -1
-*ELEMENT, TYPE=C3D4, ELSET=one
-7, 1, 2, 3, 4
-9, 1, 3, 2, 5
-*NSET, NSET=low, GENERATE
-1, 3, 1
-*ELSET, ELSET=both
-one, 9
-*SURFACE, NAME=side, TYPE=ELEMENT
-7, S2
-both, S3
-"""
 
 
 def flipped(rng, data, at, others):
@@ -309,13 +205,8 @@ def damaged(rng, data, others):
 
 
 def read(path):
-    """Read a file as commands do; return True if it contains a valid QP or mesh."""
+    """Read a file as commands do; return True if it contains a valid QP."""
     try:
-        if path.suffix in (".msh", ".inp", ".med"):
-            mesh = read_msh(path)
-            assert mesh.cells.max() < len(mesh.points)
-            assert np.isfinite(mesh.points).all()
-            return True
         if path.suffix == ".hdf5":
             contact = read_fclib(path).contact
             assert contact.W.shape == (contact.q.size,) * 2

@@ -425,16 +425,12 @@ def test_a_hostile_qps_text_is_refused_with_its_line(tmp_path, old, new, message
     assert len(str(caught.value)) < 700
 
 
-# gmsh
+# random damage; of meshes, in problems/fem/test_damaged_meshes.py
 
-
-# random damage
-
-#: numbers of damaged files in the slow test: 3600 QPs, 500 of FCLIB, 3000 meshes
+#: numbers of damaged files in the slow test
 COUNTS = {
     **dict.fromkeys(("npz", "mat", "parquet", "qps", "json"), 600),
     "hdf5": 500,
-    **dict.fromkeys(("msh", "inp", "med"), 1000),
 }
 
 

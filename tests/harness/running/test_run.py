@@ -139,7 +139,7 @@ OUTCOMES = {
     "zero": (Verdict.WRONG, "solved", None),
     "mutates": (
         Verdict.FAILED, "failed",
-        "ValueError: assignment destination is read-only (adversaries.py:316)",
+        "ValueError: assignment destination is read-only (adversaries.py:282)",
     ),
     # the timed solves are those of another QP, and the last one is judged
     "mutatesbyforce": (Verdict.FAILED, "failed", ""),
