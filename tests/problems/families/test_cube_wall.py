@@ -6,7 +6,7 @@ import meshio
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError, certify
+from mortarbench.harness import certify
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.reports.export.vtu import write_vtu
@@ -97,17 +97,3 @@ def test_energies_fall_and_converge_with_smaller_cells():
     ]
     assert (np.diff(energies) < 0).all()
     assert (np.diff(energies, 2) > 0).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("n=0/dual", "n=0 must be at least 1"),
-        ("n=4/feti=2/primal", "feti with form primal is not built"),
-        ("n=4/glue=redundant/dual", "glue=redundant is not used by feti=0"),
-        ("n=4000/dual", "of memory; expected a mesh that fits"),
-    ],
-)
-def test_keys_without_meaning_are_refused(name, message):
-    with pytest.raises(InputError, match=message):
-        parse(f"cube-wall/{name}", PROBLEMS).build(reference_solution)

@@ -174,32 +174,6 @@ def test_names_contain_the_keys_of_finite_strain_only_if_they_are_set():
     assert finite.name.endswith("steps=1/kinematics=finite/newton=2/dual")
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("beam-ring/newton=2/dual", "newton=2 is not used by kinematics=linear"),
-        ("beam-ring/material=svk/dual", "material=svk is not used by"),
-        ("beam-ring/contact_stiffness=geometric/dual", "is not used by"),
-        ("beam-ring/kinematics=finite/relin=2/dual", "relin=2 with kinematics=finite "
-         "is not built; expected relin=1, or kinematics=linear"),
-        ("beam-ring/kinematics=finite/plane=stress/dual", "plane=stress with"),
-        ("beam-ring/kinematics=finite/friction=coulomb/mu=0.3/dual",
-         "friction=coulomb with kinematics=finite is not built"),
-        ("beam-ring/kinematics=finite/contact=mortar/contact_stiffness=geometric/dual",
-         "contact_stiffness=geometric with contact=mortar is not built; expected "
-         "contact=nts"),
-        ("beam-ring/kinematics=large/dual", "kinematics='large' is unknown"),
-        ("hertz-plane/kinematics=finite/newton=-1/dual", "newton=-1 must be at least"),
-        ("contact-patch/stretch=0.8/dual", "stretch=0.8 is not used by"),
-        ("contact-patch/kinematics=finite/stretch=1.2/dual", "stretch=1.2 must be"),
-    ],
-)  # fmt: skip
-def test_inconsistent_keys_are_refused_in_one_line(name, message):
-    with pytest.raises(InputError, match=message) as e:
-        parse(name, problems.PROBLEMS)
-    assert "\n" not in str(e.value)
-
-
 def test_a_softening_material_is_refused_at_the_softening_stretch():
     """The pressure on this material is largest at the stretch 1/√3."""
     with pytest.raises(InputError, match=r"material=svk softens from 0\.5774 on"):

@@ -274,33 +274,6 @@ def test_quasi_static_slip_starts_from_the_previous_step():
     assert kkt_residuals(path.qp, s).worst < 1e-9
 
 
-REFUSED = [
-    ("beam-ring/friction=sliding/dual", "expected 'none' or 'tresca' or 'coulomb'"),
-    ("beam-ring/friction=tresca/dual", "friction=tresca needs bound, a traction"),
-    ("beam-ring/friction=coulomb/dual", "friction=coulomb needs mu, a coefficient"),
-    ("beam-ring/friction=coulomb/bound=1e6/mu=0.1/dual", "bound=1e+06 is not used by"),
-    ("beam-ring/mu=0.1/dual", "mu=0.1 is not used by friction=none; expected no mu"),
-    ("beam-ring/friction=tresca/bound=-5/dual", "bound=-5; expected a traction of 0"),
-    ("contact-patch/friction=coulomb/mu=-0.1/dual", "mu=-0.1; expected a coefficient"),
-    (
-        "contact-patch/loading=static/dual",
-        "loading=static is not used by friction=none",
-    ),
-    ("beam-ring/friction=coulomb/mu=1/loading=slow/dual", "'quasi-static' or 'static'"),
-    ("hertz-plane/friction=coulomb/dual", "unknown key 'friction'"),
-    ("obstacle/mu=0.3/primal", "unknown key 'mu'"),
-]
-
-
-@pytest.mark.parametrize(("name", "message"), REFUSED)
-def test_keys_that_do_not_fit_the_law_are_refused_in_one_line(name, message):
-    with pytest.raises(InputError) as e:
-        parse(name, PROBLEMS)
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
-
-
 @pytest.mark.parametrize(
     "load", [(0.0, 1.0), pytest.param((1.0, 1.0), marks=pytest.mark.slow)]
 )

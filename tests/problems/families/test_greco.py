@@ -5,10 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError
-from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
-from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.greco import PUBLISHED, Greco
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -91,18 +88,6 @@ def test_without_friction_there_is_no_tangential_force():
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
-    [("n=1", "greco: n=1 must be at least 2"),
-     ("mu=-0.5", "greco: mu=-0.5 must be between 0 and")],
-)  # fmt: skip
-def test_values_out_of_range_are_refused(name, message):
-    with pytest.raises(InputError) as e:
-        parse(f"greco/{name}/dual", PROBLEMS)
-
-    assert message in str(e.value)
-
-
-@pytest.mark.parametrize(
     ("n", "depth"), [(4, 2), pytest.param(8, 2, marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize(
@@ -132,8 +117,3 @@ def test_every_layer_of_the_extruded_plate_is_the_plane_one(n, depth, form):
         assert layer.tolist() == states[0][0][np.argsort(ground[:, 0])].tolist()
     for name in ("normal_force", "tangential_sum", "published_error"):
         assert states[1][1][name] == pytest.approx(states[0][1][name], rel=1e-8)
-
-
-def test_layers_in_the_plane_are_refused():
-    with pytest.raises(InputError, match="depth=2 is not used by dim=2"):
-        FAMILY.with_keys(depth=2)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
@@ -175,24 +174,6 @@ def test_an_interior_point_method_finds_the_same():
 
     ours, theirs = result(**keys), result(Clarabel(), **keys)
     assert ours["shear_centre"] == pytest.approx(theirs["shear_centre"], rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [("Q=0.5", "Q=0.5 needs law=cattaneo"), ("peak=0.5", "peak=0.5 needs law=cattaneo"),
-     ("law=cattaneo", "Q=0.0 must be between 0 and 1"),
-     ("law=cattaneo/Q=1", "Q=1.0 must be between 0 and 1, a fraction of μP"),
-     ("law=cattaneo/Q=-0.5", "Q=-0.5 must be between 0 and 1"),
-     ("law=cattaneo/Q=0.6/peak=0.5", "must be between -peak and peak=0.5"),
-     ("law=coulomb", "law='coulomb' is unknown, expected 'hertz' or 'cattaneo'"),
-     ("n=1", "n=1 must be at least 2"), ("n=90000000", "a full matrix of 90000000")],
-)  # fmt: skip
-def test_unused_and_missing_keys_of_the_law_are_refused_in_one_line(name, message):
-    with pytest.raises(InputError, match="half-plane: ") as e:
-        parse(f"half-plane/{name}/dual", PROBLEMS)
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def test_an_unused_peak_is_not_in_the_canonical_name():

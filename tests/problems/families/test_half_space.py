@@ -416,33 +416,6 @@ def test_rough_spheres_touch_on_less_area_under_higher_pressure():
     assert "p_max_error" not in rough
 
 
-@pytest.mark.parametrize(
-    ("keys", "text"),
-    [
-        (dict(n=3), "n=3 must be between 4 and 8192"),
-        (dict(law="flat"), "expected 'hertz' or 'mindlin' or 'rough'"),
-        (dict(nu=0.6), "nu=0.6 must be between 0 and 0.5"),
-        (dict(law="mindlin", Q=1), "Q=1 must be between 0 and 1"),
-        (dict(law="mindlin", mu=-1), "mu=-1 must be positive"),
-        (dict(Q=0.3), "Q=0.3 is not used by law=hertz with friction=none"),
-        (dict(seed=1), "seed=1 is not used by law=hertz"),
-        (dict(law="mindlin", roughness=0.1), "roughness=0.1 is not used by law=mindl"),
-        (dict(law="mindlin", friction="coulomb"), "expected no friction, or law=hertz"),
-        (dict(law="rough", friction="tresca"), "friction=tresca with law=rough is not"),
-        (dict(law="rough", n=32), "n=32 must be at least 64 for law=rough"),
-        (dict(friction="tresca"), "friction=tresca needs bound, a traction"),
-        (dict(friction="tresca", bound=1.0, mu=0.2), "mu=0.2 is not used"),
-        (dict(bound=1.0), "bound=1.0 is not used by law=hertz with friction=none"),
-        (dict(friction="coulomb", n=64), "expected n=48 or less, or law=mindlin"),
-    ],
-)
-def test_wrong_keys_are_refused_in_one_line(keys, text):
-    with pytest.raises(InputError) as e:
-        FAMILY.with_keys(**keys)
-    assert text in str(e.value)
-    assert "\n" not in str(e.value)
-
-
 def test_a_grid_that_does_not_fit_into_memory_is_refused(monkeypatch):
     monkeypatch.setenv("MORTARBENCH_CASE_MIB", "100")
     with pytest.raises(InputError, match="600 × 600 cells takes"):

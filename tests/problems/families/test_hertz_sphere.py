@@ -228,29 +228,3 @@ def test_a_tangential_force_leaves_the_middle_sticking():
     # because both bodies have the same material, Q does not change the pressure
     for name in ("contact_radius", "p_max", "approach"):
         assert values[name] == pytest.approx(pressed[name], rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("keys", "message"),
-    [
-        ("load=100/dual", "the contact radius 1.398 is more than R/8 = 1"),
-        ("nu=0.5/dual", "nu=0.5 must be between -1 and 0.5"),
-        ("against=spher/dual", "against='spher' is unknown, expected 'plane' or 'sph"),
-        (
-            "contact=nts/dual",
-            "contact=nts is not used by against=plane; expected no contact, or aga",
-        ),
-        ("basis=standard/dual", "basis=standard is not used by against=plane"),
-        (
-            "Q=0.5/dual",
-            "Q=0.5 is not supported with against=plane; expected against=sphere",
-        ),
-        ("against=sphere/Q=1/dual", "Q=1.0 must be at least 0 and below 1, a fraction"),
-        ("against=sphere/mu=0.2/dual", "mu=0.2 is not used by Q=0; expected no mu"),
-        ("dual-bounds", "dual-bounds"),
-        ("n=0/dual", "n=0 must be at least 1"),
-    ],
-)
-def test_meaningless_combinations_are_refused(keys, message):
-    with pytest.raises(InputError, match=message):
-        parse(f"hertz-sphere/{keys}", PROBLEMS).build(reference_solution)

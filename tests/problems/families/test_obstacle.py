@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.families.feti_models import (
     CONTACT_RADIUS,
@@ -190,18 +189,3 @@ def test_over_the_hemisphere_the_membrane_converges_with_second_order(form):
     assert rates([g["energy_error"] for g in got]) == pytest.approx(2, abs=0.15)
     assert got[-1]["max_error"] <= 2e-3
     assert abs(got[-1]["force_error"]) <= 2e-3
-
-
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        ({"dim": 3}, "dim=3 is unknown, expected 1 or 2"),
-        ({"n": 1}, "n=1 must be at least 2"),
-        ({"shape": "hemisphere", "dim": 1}, "shape=hemisphere needs dim=2"),
-    ],
-)
-def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
-    with pytest.raises(InputError) as e:
-        FAMILY.with_keys(**bad)
-
-    assert message in str(e.value)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.families.patch import ContactPatch, model
 from mortarbench.problems.fem.mesh import as_vectors
@@ -114,22 +113,6 @@ def test_the_energy_is_minus_half_the_work_of_the_pressure(form):
     )
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        ({"lower": 0}, "lower=0 must be at least 1"),
-        ({"ratio": 0.0}, "ratio=0.0 must be positive"),
-        ({"slave": "both"}, "slave='both' is unknown, expected 'lower' or 'upper'"),
-        ({"basis": "cubic"}, "basis='cubic' is unknown, expected 'dual' or 'standard'"),
-    ],
-)
-def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
-    with pytest.raises(InputError) as e:
-        FAMILY.with_keys(**bad)
-
-    assert message in str(e.value)
-
-
 @pytest.mark.parametrize("distort", [pytest.param(0.0, marks=pytest.mark.slow), 0.2])
 @pytest.mark.parametrize("slave", ["lower", "upper"])
 @pytest.mark.parametrize("basis", ["dual", "standard"])
@@ -162,23 +145,3 @@ def test_the_displacement_in_space_is_the_exact_linear_one(form):
     assert u == pytest.approx(exact, abs=1e-9)
     assert quantities["energy"] == pytest.approx(-0.5 * 1e6 * 0.1, rel=1e-8)
     assert quantities["contact_force"] == pytest.approx([0, 0, -1e6], abs=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        (
-            dict(distort=0.1),
-            "distort=0.1 is not used by dim=2; expected no distort, or",
-        ),
-        (dict(dim=3, distort=0.5), "distort=0.5 must be between 0 and 0.35"),
-        (
-            dict(dim=3, plane="stress"),
-            "plane=stress with dim=3 is not built; expected plane",
-        ),
-        (dict(dim=3, kinematics="finite"), "kinematics=finite with dim=3 is not built"),
-    ],
-)
-def test_keys_that_the_dimension_excludes_are_refused(bad, message):
-    with pytest.raises(InputError, match=message):
-        FAMILY.with_keys(**bad)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mortarbench.harness import Case, InputError
+from mortarbench.harness import Case
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.feti_models import (
@@ -118,20 +118,3 @@ def test_every_load_pulls_with_one_meganewton(load, keys):
     f = -plate.qp.q.reshape(-1, plate.dim)
     assert f[:, -1].sum() == pytest.approx(-1.0)
     assert not f[:, :-1].any()
-
-
-@pytest.mark.parametrize(
-    ("keys", "message"),
-    [
-        ({"jump": 2.0}, "jump=2.0 is not used by pattern=uniform"),
-        ({"pattern": "stripes"}, "'uniform' or 'checkerboard' or 'column'"),
-        ({"glue": "tape"}, "'orthonormal' or 'redundant'"),
-        ({"Sx": 0}, "Sx=0 must be at least 1"),
-        ({"width": -1.0}, "width=-1.0 must be between 0 and"),
-        ({"Sz": 2}, "Sz=2 is not used by dim=2"),
-        ({"dim": 3, "plane": "stress"}, "plane=stress with dim=3 is not built"),
-    ],
-)
-def test_keys_that_do_not_fit_are_refused(keys, message):
-    with pytest.raises(InputError, match=message):
-        Plate(**keys)

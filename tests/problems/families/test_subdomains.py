@@ -136,34 +136,6 @@ def test_unsupported_combinations_are_refused_by_name(press, name, message):
         built(name)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("obstacle/feti=-1/dual", "feti=-1 must be at least 0"),
-        ("obstacle/glue=redundant/dual", "glue=redundant is not used by feti=0"),
-        ("contact-patch/feti=2/glue=tape/dual", "glue='tape' is unknown"),
-        ("bodies:press.toml/parts=-1/dual", "parts=-1 must be at least 0"),
-        (
-            "bodies:press.toml/glue=redundant/dual",
-            "glue=redundant is not used by parts=0",
-        ),
-        (
-            "bodies:press.toml/feti=4/dual",
-            "unknown key 'feti'; .*parts",
-        ),
-        (
-            "greco/parts=4/dual",
-            "unknown key 'parts'; .*feti",
-        ),
-    ],
-)
-def test_keys_that_do_not_fit_are_refused_before_anything_is_built(
-    press, name, message
-):
-    with pytest.raises(InputError, match=message):
-        parse(name, PROBLEMS)
-
-
 @pytest.mark.parametrize(("n", "most"), [(4, 45), (8, 60)])
 def test_subdomains_of_graded_meshes_are_compact(n, most):
     """With blocks of 8 × 8 cells, 95 (n = 4) and 359 (n = 8) products would be

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.families.variational import JournalBearing, String, Torsion
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
@@ -115,19 +114,3 @@ def test_another_method_has_the_same_solution(family, keys):
 
     assert s.x == pytest.approx(other.x, abs=1e-5 * np.abs(other.x).max())
     assert case.qp.objective(s.x) == pytest.approx(case.qp.objective(other.x), rel=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("family", "bad", "message"),
-    [
-        (String(), {"n": 2}, "n=2 must be at least 3"),
-        (Torsion(), {"twist": 0.0}, "twist=0.0 must be positive"),
-        (JournalBearing(), {"eccentricity": 1.0}, "eccentricity=1.0 must be below 1"),
-    ],
-    ids=["string", "torsion", "journal bearing"],
-)
-def test_values_out_of_range_are_refused(family, bad, message):
-    with pytest.raises(InputError) as e:
-        family.with_keys(**bad)
-
-    assert message in str(e.value)
