@@ -94,6 +94,8 @@ cdef extern from "vectors.h" nogil:
                  double *free, Py_ssize_t n, double *result)
     void projected(const double *x, double alpha, const double *p, const double *lower,
                    const double *upper, double *y, Py_ssize_t n)
+    void projected_gradient(const double *x, const double *g, const double *lower,
+                            const double *upper, double *y, Py_ssize_t n)
     void model_minimiser(const double *x, const double *g, double tau,
                          const double *lower, const double *upper, double *s,
                          double *piece, Py_ssize_t n)

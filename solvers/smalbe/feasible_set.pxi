@@ -190,12 +190,7 @@ cdef class FeasibleSet:
         """gP ← φ + β."""
         cdef Py_ssize_t i, j, k
         cdef double square, inward
-        for i in range(self.n):
-            gP[i] = g[i]
-            if (x[i] <= self.lower[i] and g[i] > 0) or (
-                x[i] >= self.upper[i] and g[i] < 0
-            ):
-                gP[i] = 0.0
+        projected_gradient(x, g, self.lower, self.upper, gP, self.n)
         for i in range(self.n_discs):
             square = self.square_of_disc(i, x)
             if self.is_inside(i, square):

@@ -153,9 +153,10 @@ factorise_incompletely(incomplete *F, in free, double keep, double shift, double
 /* Forward and backward substitution on the run [a, b) of a factor by diagonals. A run is
    no longer than the second offset, so that only entries next to the main diagonal
    couple its components. */
-INLINE void forward_run(const incomplete *F, Py_ssize_t a, Py_ssize_t b)
+INLINE void forward_run(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v)
 {
     double *y = F->y;
+    memcpy(y + a, v + a, (b - a) * sizeof(double));
     for (Py_ssize_t c = F->count - 1; c >= 0; c--) {
         Py_ssize_t o = F->offset[c], first = LARGER(a, o);
         const double *band = F->L + c * F->width;
@@ -196,11 +197,11 @@ CLONED static void solve_incompletely(const incomplete *F, double s, in v, out z
 {
     double *y = F->y;
     memset(z, 0, F->n * sizeof(double));
-    for (Py_ssize_t r = 0; r < F->runs; r++)
+    for (Py_ssize_t r = 0; r < F->runs && !F->count; r++)
         memcpy(y + F->from[r], v + F->from[r], (F->to[r] - F->from[r]) * sizeof(double));
     for (Py_ssize_t r = 0; r < F->runs; r++) {
         if (F->count)
-            forward_run(F, F->from[r], F->to[r]);
+            forward_run(F, F->from[r], F->to[r], v);
         for (Py_ssize_t j = F->from[r]; j < F->to[r] && !F->count; j++)
             for (int k = F->start[j]; k < F->start[j + 1]; k++)
                 y[F->row[k]] -= F->L[k] * y[j]; /* L is zero in rows that are not free */

@@ -220,34 +220,36 @@ cdef class DenseBasis(Basis):
     cdef double *core  # factor of τI + W¹ᐟ² U_F U_Fᵀ W¹ᐟ², see `solve_cholesky`
     cdef double *c
     cdef double *t  # (n,)
+    cdef double *row  # (n,)
 
     @staticmethod
     cdef DenseBasis zeros(Py_ssize_t k, Py_ssize_t n):
         cdef DenseBasis new = DenseBasis.__new__(DenseBasis)
         new.make_room(n, k, n)
         new.flips = n + 1
-        new.room = Room((k + 2) * n + k * (2 * k + 1))
+        new.room = Room((k + 3) * n + k * (2 * k + 1))
         new.U = new.room.at
         new.gram, new.core = new.U + k * n, new.U + k * n + k * k
         new.c, new.t = new.core + k * k, new.core + k * k + k
-        new.active = new.t + n
+        new.active, new.row = new.t + n, new.t + 2 * n
         return new
 
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², F: components with `piece` zero.
 
-        Because the rows are orthonormal, `gram` is I minus the sum over active
-        components. To limit rounding errors, gram is recomputed after as many changes
-        as there are components. The factorised matrix is bounded below by τI.
+        To limit rounding errors, `gram` is recomputed after as many changes as there
+        are components. The factorised matrix is bounded below by τI.
         """
         cdef Py_ssize_t i, j
         cdef int k = self.k, n = self.n, info = 0
         if self.flips > n:
             self.flips = 0
-            memset(self.active, 0, n * sizeof(double))
-            memset(self.gram, 0, k * k * sizeof(double))
+            for i in range(n):
+                self.active[i] = piece[i] != 0
+                self.t[i] = 1 - self.active[i]
             for i in range(k):
-                self.gram[i * k + i] = 1.0
+                masked(self.t, self.U + i * n, self.row, n)
+                rows_times(self.U, self.row, self.gram + i * k, i + 1, n)
         for i in range(n):
             if self.active[i] != (piece[i] != 0):
                 add_outer(2 * self.active[i] - 1, self.U + i, n, self.gram, k)

@@ -421,10 +421,15 @@ cdef class SMALBE(MPRGP):
 
     # recovery
 
-    def point(self, nu, mu, lb, ub):
+    def point(self, nu, mu, double rho, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
-        For a = ‖𝒫F𝒫‖μ − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient of the
+        First, ν moves towards Cν = 0 on its face: the outer loop ends with ‖Cν‖ of the
+        order of the tolerance, which is the error of the force balance. Projections
+        onto {Cν = 0} and onto the free components alternate (von Neumann) as long as a
+        pair halves ‖Cν‖. Active bounds and discs remain active.
+
+        For a = ‖𝒫F𝒫‖(μ + ρCν) − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient of the
         projected problem up to rounding and terms of the order of ‖Cν‖. On the free
         components, where the residual must vanish, a least-squares correction of a
         removes these errors.
@@ -434,7 +439,7 @@ cdef class SMALBE(MPRGP):
         cdef list owners = []
         cdef Parts parts
         restored_x, multipliers, boxes, product = empty(n), zeros(r), zeros(n), empty(n)
-        cdef const double *v = read(nu, owners)
+        cdef double *v = self.x
         cdef const double *at_mu = read(mu, owners)
         cdef const double *least = read(lb, owners)
         cdef const double *most = read(ub, owners)
@@ -445,8 +450,20 @@ cdef class SMALBE(MPRGP):
         cdef double *rest = self.s
         cdef double *free = self.x2
         cdef double *da = self.Cv
-        cdef double square, push
+        cdef double square, push, error, before = INFINITY
+        memcpy(v, read(nu, owners), n * sizeof(double))
         self.set.split(v, v, 1.0, self.t, free, &parts)
+        self.rows.times(v, da)
+        for i in range(r):
+            a[i] = self.norm * (at_mu[i] + rho * da[i])
+        error = self.rows.size(da)
+        while 0 < 2 * error < before:
+            memset(rest, 0, n * sizeof(double))
+            self.rows.add(1.0, da, rest)
+            masked(free, rest, rest, n)
+            self.set.project(v, 1.0, rest, v)
+            self.rows.times(v, da)
+            before, error = error, self.rows.size(da)
         for i in range(n):  # x̃ + ν may differ from a bound in the last bit
             x[i] = fmin(fmax(self.rows.x_tilde[i] + v[i], least[i]), most[i])
             if v[i] >= self.upper[i]:
@@ -465,10 +482,10 @@ cdef class SMALBE(MPRGP):
             rest[i] = Fx[i] + self.q[i]
             any_left = any_left or rest[i] != 0
         if not any_left:  # x is the unconstrained minimiser
-            return restored_x, multipliers, boxes, product
+            return restored_x, zeros(r), boxes, product
         self.rows.times(rest, da)
         for i in range(r):
-            a[i] = self.norm * at_mu[i] - da[i]
+            a[i] -= da[i]
         self.rows.add(1.0, a, rest)
         if r:
             memcpy(self.t, rest, n * sizeof(double))

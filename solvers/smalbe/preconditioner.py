@@ -94,7 +94,9 @@ class Sparsity(NamedTuple):
     least: float  #: smallest sum Σⱼ Pᵢⱼ of a row, relative to Pᵢᵢ
 
 
-def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
+def resolved_preconditioner(
+    qp: QP, kind: Preconditioner, P: Sparsity | None = None
+) -> Preconditioner:
     """Replace ``auto`` by the preconditioner that is fastest for `qp`.
 
     A CG step with an incomplete factor costs four to seven times as much as a step
@@ -103,6 +105,8 @@ def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
     fourth root of `Sparsity.spread`. The choice of ``auto`` is dirichlet if P is an
     operator that provides it, otherwise incomplete if it saves time, otherwise diagonal
     if the diagonal of a sparse P varies, otherwise model.
+
+    P : the result of `sparsity_of` for `qp`, if it is known
     """
     if kind != "auto":
         return kind
@@ -110,9 +114,9 @@ def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
         return "model"
     if preconditioned_operator(qp):
         return "dirichlet"
-    if not _is_sparse(qp):
+    P = P or sparsity_of(qp)
+    if P is None:
         return "model"
-    P = _sparsity(qp)
     pays = P.levels * P.spread**0.25 >= MIN_DIFFICULTY
     if pays and P.pairs <= MAX_PAIRS * qp.P.nnz:
         return "incomplete"
@@ -121,13 +125,12 @@ def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
     return "diagonal" if varies else "model"
 
 
-def incomplete_factor(qp: QP) -> tuple[float, IncompleteFactor]:
+def incomplete_factor(qp: QP, P: Sparsity) -> tuple[float, IncompleteFactor]:
     """Return a bound on ‖P‖ and the incomplete factor of P divided by this bound.
 
     Dropped entries are added to the diagonal only if no row sum of P is negative, apart
     from rounding: P then maps the vector of ones to zero in the interior of a domain.
     """
-    P = _sparsity(qp)
     return P.norm, IncompleteFactor(qp.P, P.norm, P.least >= -ROUNDING)
 
 
@@ -138,17 +141,23 @@ def has_sparse_factor(qp: QP) -> bool:
     because a factor of P does not include the penalty of rows. The columns of P must
     have so few entries that a factor costs no more than several products.
     """
-    return _is_sparse(qp) and _sparsity(qp).pairs <= MAX_PAIRS * qp.P.nnz
+    P = sparsity_of(qp)
+    return P is not None and P.pairs <= MAX_PAIRS * qp.P.nnz
 
 
-def _is_sparse(qp: QP) -> bool:
-    if not issparse(qp.P) or qp.b.size or qp.h.size or not qp.q.size:
-        return False
-    return len(qp.sets) == 1 and bool(qp.P.nnz < 2**31)
-
-
-def _sparsity(qp: QP) -> Sparsity:
+def sparsity_of(qp: QP) -> Sparsity | None:
+    """Return the properties of a sparse P of a QP with bounds only, otherwise None."""
     P = qp.P
+    if (
+        isinstance(P, np.ndarray)
+        or not issparse(P)
+        or qp.b.size
+        or qp.h.size
+        or not qp.q.size
+    ):
+        return None
+    if len(qp.sets) > 1 or P.nnz >= 2**31:
+        return None
     return Sparsity(*sparsity(P if P.format in ("csr", "csc") else csc_matrix(P)))
 
 

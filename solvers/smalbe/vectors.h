@@ -295,6 +295,15 @@ CLONED static void projected(const double *x, double alpha, const double *p, in 
     }
 }
 
+/* y = g, but 0 where -g points out of the box at a bound. */
+CLONED static void projected_gradient(in x, in g, in lower, in upper, out y, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++) {
+        int leaves = ((x[i] <= lower[i]) & (g[i] > 0)) | ((x[i] >= upper[i]) & (g[i] < 0));
+        y[i] = leaves ? 0.0 : g[i];
+    }
+}
+
 /* s = argmin gᵀs + τ/2‖s‖² over the box. piece receives -1 for components at the
    lower bound, 1 at the upper bound, else 0. */
 CLONED static void model_minimiser(in x, in g, double tau, in lower, in upper, out s,

@@ -190,7 +190,7 @@ def test_recovered_multipliers_fit_the_gradient_on_free_components(seed):
     run = outer_loop(problem, qp, options)
     start = run.first(0 * qp.q, np.zeros(len(problem.rows.C)), M=1.0, rho=1e4)
     at = run.solve(1e-8, start)
-    x, a, z_box, Px = run.solver.point(at.nu, at.mu, qp.lb, qp.ub)
+    x, a, z_box, Px = run.solver.point(at.nu, at.mu, at.rho, qp.lb, qp.ub)
     C, free = problem.rows.C, (at.nu > problem.bounds[0]) & (at.nu < problem.bounds[1])
     r = qp.P @ x + qp.q
     best = np.linalg.lstsq(C.T[free], -r[free], rcond=None)[0]

@@ -20,7 +20,7 @@ from tests.support.incomplete_cholesky import (
 from tests.support.sparse_qps import laplacian, qp_with_minimum, sparse_matrix
 
 FACTORS = replace(SOLVERS["smalbe"], preconditioner="incomplete")
-KEEP = 0.95  #: share of dropped entries that is added to the diagonal
+KEEP = 0.99  #: share of dropped entries that is added to the diagonal
 
 
 def factor(P, keep=True):
