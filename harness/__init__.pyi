@@ -10,7 +10,6 @@ from .mechanics import Grid as Grid
 from .mechanics import Mechanics as Mechanics
 from .plugin import About as About
 from .plugin import Case as Case
-from .plugin import CaseOnRanks as CaseOnRanks
 from .plugin import Chained as Chained
 from .plugin import ContactSide as ContactSide
 from .plugin import Divided as Divided

@@ -21,7 +21,7 @@ from mortarbench.harness.keys import Value, keys_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mortarbench.harness.distributed.comm import Comm
+    from mortarbench.harness.distributed.comm import Team
     from mortarbench.harness.mechanics import (
         CellBlock,
         DecomposedMechanics,
@@ -271,22 +271,12 @@ class Case:
     remarks: tuple[str, ...] = ()  #: warnings about the input; each is a single line
 
 
-class CaseOnRanks(NamedTuple):
-    """A case that several ranks have built together."""
-
-    #: object on this rank whose methods rank 0 calls on all ranks by
-    #: ``served.lead(METHOD, …)``; the attribute `lead` is set before `case` is called
-    served: Any
-    #: returns the case on rank 0, while the other ranks serve
-    case: Callable[[], Case]
-
-
 class Divided(NamedTuple):
     """The subdomains of a case."""
 
     subdomains: int  #: number of subdomains, which is the largest number of ranks
-    #: builds the case; all ranks call this function together
-    build: Callable[[Comm, ReferenceOfOperator], CaseOnRanks]
+    #: builds the case on rank 0, while the other ranks serve
+    build: Callable[[Team, ReferenceOfOperator], Case]
 
 
 class Family(ABC):

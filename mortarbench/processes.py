@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mortarbench.harness.distributed.comm import RECORD, Comm
+from mortarbench.harness.distributed.comm import RECORD, Team
 from mortarbench.harness.distributed.mpi import too_few_parts
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.names import assemble
-from mortarbench.harness.plugin import CaseOnRanks
+from mortarbench.harness.plugin import Case
 from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.ranks import launch
 from mortarbench.harness.processes.solver_file import read_solver
@@ -42,7 +42,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
             spec = with_history(spec, solvers)
         solver = resolve(spec, solvers)
 
-    def build(case: Mapping[str, Any], comm: Comm) -> CaseOnRanks:
+    def build(case: Mapping[str, Any], team: Team) -> Case:
         from mortarbench.solvers.reference.operators import reference_of_operator
 
         name = case["family"]
@@ -50,10 +50,10 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
             name, registries.families[name], case["params"], case["form"]
         )
         parts = case_id.family.divided(case_id.form)
-        if parts is None or parts.subdomains < comm.size:
+        if parts is None or parts.subdomains < team.comm.size:
             count = 1 if parts is None else parts.subdomains
-            raise InputError(too_few_parts(count, comm.size))
-        return parts.build(comm, reference_of_operator)
+            raise InputError(too_few_parts(count, team.comm.size))
+        return parts.build(team, reference_of_operator)
 
     work = Worker(
         solver=solver,

@@ -1,12 +1,11 @@
 """Ranks: the processes of one solve, of which rank 0 leads and the others serve.
 
-All ranks build a problem together; each of them assembles and factorises its own
-subdomains. Afterwards, rank 0 alone runs the solver, the certificate and all other
-code, on whole vectors. Objects whose methods need all ranks, such as the dual operator,
-exist on every rank. Rank 0 calls a method of such an object by `Lead`; the other ranks
-receive the name of the method with its arguments (`serve`) and execute the same method,
-which ends in a sum or in a gathering on rank 0. Hence every decision is made by rank 0,
-and the ranks cannot diverge.
+Rank 0 builds a problem and runs the solver, the certificate and all other code, on
+whole vectors. Objects whose work is divided, such as the subdomains and the dual
+operator, have a part on every rank. Rank 0 places the parts and calls their methods
+(`Team`); the other ranks receive each order (`Team.serve`) and execute the same method
+of their parts, whose results are added or collected on rank 0. Hence every decision is
+made by rank 0, and the ranks cannot diverge.
 
 `Comm` is the communicator of one process, and `_MPIComm` that of MPI. Another one, such
 as threads, is one more class with these members.
@@ -20,8 +19,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
-from operator import attrgetter
+from itertools import count
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
@@ -67,16 +65,27 @@ class Comm:
         """
         return part
 
-    def fill(self, v: NDArray[Any], parts: Sequence[slice]) -> None:
-        """Copy the parts of v, one of each rank, from their ranks to v on rank 0."""
+    def scatter(self, parts: Sequence[T] | None) -> T:
+        """Return the part of this rank; rank 0 sends one part to each rank."""
+        assert parts is not None
+        return parts[0]
+
+    def split(self, v: NDArray[Any] | None, ends: Sequence[int], kind: str) -> Any:
+        """Return the part of this rank of a vector of rank 0.
+
+        v : vector on rank 0, None elsewhere
+        ends : the part of rank r begins at ``ends[r]`` and ends before ``ends[r + 1]``
+        kind : character of the data type of v
+        """
+        return v
+
+    def join(self, part: NDArray[Any], ends: Sequence[int]) -> NDArray[Any]:
+        """Return the vector with the parts of all ranks on rank 0; see `split`."""
+        return part
 
     def gather(self, part: T) -> list[T]:
         """Return the values of all ranks on rank 0, an empty list elsewhere."""
         return [part]
-
-    def bcast(self, value: T, root: int = 0) -> T:
-        """Return the value of the rank `root`."""
-        return value
 
     def together(self, work: Callable[[], T]) -> T:
         """Call `work` on all ranks; raise on all ranks if it fails on any rank.
@@ -135,19 +144,36 @@ class _MPIComm(Comm):
             total += received
         return total
 
-    def fill(self, v: NDArray[Any], parts: Sequence[slice]) -> None:
-        if self.rank:
-            self._comm.Send(v[parts[self.rank]], dest=0, tag=_PART)
-            return
+    def scatter(self, parts: Sequence[T] | None) -> T:
+        if parts is None:
+            part: T = self._comm.recv(source=0, tag=_PART)
+            return part
+        for rank in range(1, self.size):  # one after the other, to limit the memory
+            self._comm.send(parts[rank], dest=rank, tag=_PART)
+        return parts[0]
+
+    def split(self, v: NDArray[Any] | None, ends: Sequence[int], kind: str) -> Any:
+        if v is None:
+            part = np.empty(ends[self.rank + 1] - ends[self.rank], dtype=kind)
+            self._comm.Recv(part, source=0, tag=_PART)
+            return part
         for rank in range(1, self.size):  # without pickled copies
-            self._comm.Recv(v[parts[rank]], source=rank, tag=_PART)
+            part = np.ascontiguousarray(v[ends[rank] : ends[rank + 1]])
+            self._comm.Send(part, dest=rank, tag=_PART)
+        return v[: ends[1]]
+
+    def join(self, part: NDArray[Any], ends: Sequence[int]) -> NDArray[Any]:
+        if self.rank:
+            self._comm.Send(np.ascontiguousarray(part), dest=0, tag=_PART)
+            return part
+        v = np.empty(ends[-1], dtype=part.dtype)
+        v[: ends[1]] = part
+        for rank in range(1, self.size):
+            self._comm.Recv(v[ends[rank] : ends[rank + 1]], source=rank, tag=_PART)
+        return v
 
     def gather(self, part: T) -> list[T]:
         return self._comm.gather(part) or []
-
-    def bcast(self, value: T, root: int = 0) -> T:
-        result: T = self._comm.bcast(value, root)
-        return result
 
     def together(self, work: Callable[[], T]) -> T:
         failure: Exception | None = None
@@ -224,64 +250,126 @@ class _Shape(tuple[Any, ...]):
     """Shape and type of an array that follows an order."""
 
 
-class Lead:
-    """Calls of methods of an object that exists on all ranks, from rank 0.
+class Team:
+    """Objects with a part on every rank, which rank 0 places and uses.
 
-    served : the object on rank 0; None when the other ranks no longer have theirs
-    name : name of the attribute, followed by a dot, of the objects with which the other
-        ranks run `serve`; empty if they serve the objects themselves
+    service : object of this rank, which is the part with the number 0
     """
 
-    def __init__(self, comm: Comm, served: Any, name: str = "") -> None:
-        self._comm, self.served, self._name = comm, served, name
+    def __init__(self, comm: Comm = SERIAL, service: Any = None) -> None:
+        self.comm, self._parts = comm, {0: service}
+        self._numbers, self.unused = count(1), list[int]()
 
-    def __call__(self, method: str, *arguments: Any) -> Any:
-        """Call a method on all ranks; return the result of rank 0.
+    def place(
+        self, build: Callable[..., Any], parts: Sequence[Any], *others: Placed
+    ) -> Placed:
+        """Call `build` on every rank, and keep its result there.
 
         An exception on any rank is raised here, see `Comm.together`.
 
-        method : name, with dots for methods of attributes
-
-        Raises
-        ------
-        RuntimeError
-            If the ranks have built another problem in the meantime.
+        Parameters
+        ----------
+        build : function of a module; its arguments are a value of `parts` and the part
+            of each of `others` on the same rank
+        parts : value for each rank, which must be picklable except for that of rank 0
 
         """
-        if self.served is None:
-            raise RuntimeError("the ranks keep only the QP that they built last")
-        self._comm.order((f"{self._name}{method}", *arguments))
-        return self._comm.together(partial(_call, self.served, method, arguments))
+        placed = Placed(self, next(self._numbers))
+        numbers = tuple(other.number for other in others)
+        self.order("_place", build, placed.number, *numbers, data=parts)
+        return placed
+
+    def map(self, work: Callable[[Any], T], parts: Sequence[Any]) -> list[T]:
+        """Return the results of a function of a module for the value of each rank."""
+        results: list[T] = self.order("_map", work, data=parts)
+        return results
+
+    def order(self, step: str, *arguments: Any, data: Any = None) -> Any:
+        """Execute a step on all ranks; return the result of rank 0.
+
+        step : name of a method of this class
+        data : first argument of the method on rank 0; None on all other ranks
+        """
+        unused, self.unused = tuple(self.unused), []
+        self.comm.order((step, unused, *arguments))
+        return self._execute(step, unused, *arguments, data=data)
+
+    def serve(self) -> None:
+        """Execute the steps that rank 0 orders, until it ends the service."""
+        while (order := self.comm.next_order()) is not None:
+            with suppress(Exception):  # rank 0 raises it as well
+                self._execute(*order)
+
+    def end(self) -> None:
+        """End the service of the other ranks."""
+        self.comm.order(None)
+
+    def _execute(
+        self, step: str, unused: Sequence[int], *arguments: Any, data: Any = None
+    ) -> Any:
+        for number in unused:
+            self._parts.pop(number, None)
+        return getattr(self, step)(data, *arguments)
+
+    def _place(
+        self, parts: Any, build: Callable[..., Any], number: int, *others: int
+    ) -> None:
+        part = self.comm.scatter(parts)
+        self._parts[number] = self.comm.together(
+            lambda: build(part, *(self._parts[other] for other in others))
+        )
+
+    def _map(self, parts: Any, work: Callable[[Any], T]) -> list[T]:
+        part = self.comm.scatter(parts)
+        return self.comm.gather(self.comm.together(lambda: work(part)))
+
+    def _call(self, _: None, *call: Any) -> list[Any]:
+        return self.comm.gather(self._result(*call))
+
+    def _total(self, _: None, *call: Any) -> Any:
+        return self.comm.sum(self._result(*call))
+
+    def _apply(self, v: Any, ends: Sequence[int], kind: str, *call: Any) -> Any:
+        part = self.comm.split(v, ends, kind)
+        return self.comm.join(self._result(*call, part), ends)
+
+    def _result(self, number: int, method: str, *arguments: Any) -> Any:
+        """Return the result of a method on this rank, if no rank has failed.
+
+        No rank waits for the result of a rank that has failed.
+        """
+        return self.comm.together(
+            lambda: getattr(self._parts[number], method)(*arguments)
+        )
 
 
-def serve(comm: Comm, served: Any) -> None:
-    """Execute the methods of `served` that rank 0 calls, until it ends the service."""
-    while (order := comm.next_order()) is not None:
-        method, *arguments = order
-        with suppress(Exception):  # rank 0 raises it as well
-            comm.together(partial(_call, served, method, arguments))
+class Placed:
+    """An object with a part on every rank; the parts are freed with this object."""
 
+    def __init__(self, team: Team, number: int) -> None:
+        self._team, self.number = team, number
 
-def _call(served: Any, method: str, arguments: Sequence[Any]) -> Any:
-    return attrgetter(method)(served)(*arguments)
+    def __call__(self, method: str, *arguments: Any) -> list[Any]:
+        """Call a method of every part; return the results of all ranks."""
+        results: list[Any] = self._team.order("_call", self.number, method, *arguments)
+        return results
 
+    def total(self, method: str, *arguments: Any) -> NDArray[Any]:
+        """Return the sum of the arrays that a method of every part returns."""
+        total: NDArray[Any] = self._team.order(
+            "_total", self.number, method, *arguments
+        )
+        return total
 
-def led(comm: Comm, served: Any, work: Callable[[], T]) -> T:
-    """Call `work` on rank 0 while the others serve; return its result on all ranks.
+    def apply(self, method: str, v: NDArray[Any], ends: Sequence[int]) -> NDArray[Any]:
+        """Return a vector of which every part computes a section from that of v.
 
-    All ranks call this function together; an exception of `work` is raised on all
-    ranks.
-    """
-    result: Any = None
-    if comm.rank:
-        serve(comm, served)
-    else:
-        try:
-            result = work()
-        except Exception as e:
-            result = e
-        comm.order(None)
-    result = comm.bcast(result)
-    if isinstance(result, Exception):
-        raise result
-    return result  # type: ignore[no-any-return]
+        ends : section r of a vector begins at ``ends[r]`` and ends at ``ends[r + 1]``
+        """
+        call = tuple(ends), v.dtype.char, self.number, method
+        result: NDArray[Any] = self._team.order("_apply", *call, data=v)
+        return result
+
+    def __del__(self) -> None:
+        """Free the parts with the next order."""
+        self._team.unused.append(self.number)

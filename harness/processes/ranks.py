@@ -7,8 +7,8 @@ execute orders that rank 0 sends. Each rank has its own CPU if there are enough 
 The memory limit applies to the sum over all ranks. If one rank ends, all other ranks
 are ended.
 
-The ranks build a case together. Rank 0 then runs the ordinary worker, whose products
-all ranks compute together (`harness.distributed.comm`).
+Rank 0 runs the ordinary worker, which builds the case, and places the subdomains on all
+ranks (`harness.distributed.comm`).
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ import numpy as np
 from mortarbench.harness.distributed.comm import (
     PEER_TIMEOUT,
     RECORD,
-    Comm,
-    Lead,
+    Placed,
     RankFailedError,
+    Team,
     world,
 )
 from mortarbench.harness.distributed.mpi import MISSING, mpiexec
 from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.errors import InputError, described
-from mortarbench.harness.plugin import Case, CaseOnRanks, Solver
+from mortarbench.harness.plugin import Case, Solver
 from mortarbench.harness.processes import parent
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Verdict
@@ -91,9 +91,8 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     return 0 if code == 0 else 1
 
 
-#: builds the case of a request, a mapping with family, params and form; all ranks call
-#: the function together
-Build: TypeAlias = "Callable[[Mapping[str, Any], Comm], CaseOnRanks]"
+#: builds the case of a request, a mapping with family, params and form, on rank 0
+Build: TypeAlias = "Callable[[Mapping[str, Any], Team], Case]"
 
 
 class Ranks:
@@ -101,10 +100,10 @@ class Ranks:
 
     Attributes
     ----------
-    served : objects of the case that the ranks have built
+    team : rank 0 and the ranks that serve
     case : the case; None on all ranks but rank 0, and after a failure
     failure : reason why the last build failed, else None
-    call : calls a method on all ranks, from rank 0
+    call : calls a method of this class on all ranks, from rank 0
 
     """
 
@@ -113,49 +112,36 @@ class Ranks:
 
         limit : sets the memory limit of this process, in MiB; None removes the limit
         """
-        self.comm, self._build, self.limit = world(), build, limit
-        self.served: Any = None
+        comm, self._build, self.limit = world(), build, limit
+        self.team = Team(comm, self)
+        self.call = Placed(self.team, 0)
         self.case: Case | None = None
         self.failure: Exception | None = None
-        self.call = Lead(self.comm, self)
         cpus = fastest_first(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cpus[self.comm.rank % len(cpus)]})
+        os.sched_setaffinity(0, {cpus[comm.rank % len(cpus)]})
         if RECORD in os.environ:
             os.set_inheritable(int(os.environ[RECORD]), False)
 
-    def build_part(self, case: Mapping[str, Any]) -> None:
-        """Build a case together with the other ranks."""
-        if self.served is not None:
-            self.served.lead.served = None  # refuses further calls
-        self.served = self.case = self.failure = None  # free memory first
+    def peak(self) -> float:
+        """Return the peak memory of this rank, in MiB."""
+        return memory_mib("VmHWM") or 0.0
+
+    def build(self, case: Mapping[str, Any]) -> dict[str, Any]:
+        """Build a case; return the entries of the event "built".
+
+        The entries are the `sizes` and the digest `qp` of the QP, and the time in s.
+        They are empty after a failure.
+        """
+        start = time.perf_counter()
+        self.case = self.failure = None
+        self.call("peak")  # any order frees the objects of the last case on all ranks
         try:
-            built = self.comm.together(lambda: self._build(case, self.comm))
-        except (InputError, RankFailedError) as e:  # all ranks raise the same error
+            self.case = self._build(case, self.team)
+        except (InputError, RankFailedError) as e:
             self.failure = e
         except Exception as e:
             self.failure = RankFailedError(described(e))
-        else:
-            self.served, self._case = built.served, built.case
-
-    def peaks(self) -> list[float]:
-        """Return the peak memory of each rank, in MiB."""
-        return self.comm.gather(memory_mib("VmHWM") or 0.0)
-
-    def build(self, case: Mapping[str, Any]) -> dict[str, Any]:
-        """Build a case on all ranks; return the entries of the event "built".
-
-        The entries are the `sizes` and the digest `qp` of the QP, and the time of the
-        slowest rank, in s. They are empty after a failure.
-        """
-        start = time.perf_counter()
-        self.call("build_part", dict(case))
-        if self.failure is not None:
-            return {}
-        self.served.lead = Lead(self.comm, self.served, "served.")
-        try:
-            self.case = self._case()
-        except InputError as e:
-            self.failure = e
+        if self.case is None:
             return {}
         seconds = time.perf_counter() - start
         sizes, digest = self.case.qp.sizes, self.case.digest
@@ -170,7 +156,7 @@ class Ranks:
 
     def reported(self) -> dict[str, float]:
         """Return the number and the peak memory of the ranks, for a solution."""
-        peaks = self.call("peaks")
+        peaks = self.call("peak")
         return {
             "ranks": len(peaks),
             "rank_peak_mib_largest": max(peaks),
@@ -183,7 +169,7 @@ class Ranks:
         if self.case is None or (s.status is Status.FAILED and not has_point(s)):
             return {"status": Verdict(s.status)}, []
         # factors that code of a solver may have reached are not used
-        self.call("served.forget")
+        self.case.qp.P.forget()
         return evaluated(self.case, s, tol)
 
 

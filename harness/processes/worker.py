@@ -40,7 +40,6 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from mortarbench.harness.distributed.comm import serve as serve_rank
 from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import write_point
@@ -75,20 +74,20 @@ def serve(
 ) -> None:
     """Answer requests until the pipe of requests is closed.
 
-    build : builds a case on all MPI ranks; None in a single process
+    build : builds a case on MPI ranks; None in a single process
     """
     if build is None:
         answer_requests(worker.answer, request_fd, reply_fd)
         return
     ranks = worker.ranks = Ranks(build, _limit_memory)
-    if ranks.comm.rank:
+    if ranks.team.comm.rank:
         os.close(request_fd)
         os.close(reply_fd)
         worker.warm_up()
-        serve_rank(ranks.comm, ranks)
+        ranks.team.serve()
         return
     answer_requests(worker.answer, request_fd, reply_fd)
-    ranks.comm.order(None)  # end the service of the other ranks
+    ranks.team.end()
 
 
 @dataclass(eq=False, kw_only=True)
@@ -166,7 +165,7 @@ class Worker:
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
         assert self.solver is not None
         ranks, solver = self.ranks, self.solver
-        set_limit: Callable[[float | None], None] = _limit_memory
+        set_limit: Callable[[float | None], object] = _limit_memory
         if ranks is not None:
             send("built", **ranks.build(request["case"]))
             solver, qp = ranks.problem(solver)

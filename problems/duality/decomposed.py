@@ -1,4 +1,4 @@
-"""Load steps of decomposed elastic bodies in contact, on one process or several ranks.
+"""Load steps of decomposed elastic bodies in contact, on several ranks.
 
 The linearisation of contact only requires the positions and displacements of the nodes
 on the contact sides; no undivided stiffness matrix is assembled.
@@ -18,7 +18,6 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from mortarbench.harness import (
     QP,
     Case,
-    CaseOnRanks,
     Friction,
     InputError,
     ReferenceOfOperator,
@@ -26,8 +25,8 @@ from mortarbench.harness import (
     Status,
     Vector,
 )
-from mortarbench.harness.distributed.comm import Comm, led
-from mortarbench.harness.mechanics import boundary_facets, contact_rows
+from mortarbench.harness.distributed.comm import Team
+from mortarbench.harness.mechanics import contact_rows
 from mortarbench.problems.contact.bodies import (
     Shape,
     UnassembledBodies,
@@ -50,30 +49,28 @@ from mortarbench.problems.duality.problem import (
     ContactSolution,
     InterfaceState,
 )
-from mortarbench.problems.fem.elasticity import rigid_modes, stiffness
-from mortarbench.problems.fem.fixing import fixing_nodes
-from mortarbench.problems.fem.mesh import Mesh, Nodes, as_vectors, dofs_of
-from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
+from mortarbench.problems.fem.mesh import Nodes, as_vectors
+from mortarbench.problems.feti.elastic import (
+    STRESS_LAYERS,
+    Patch,
+    elastic_class,
+    largest_in_patches,
+)
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.partition import graph_partition
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.structured import blocks_of_meshes
 from mortarbench.problems.feti.subdivision import Subdivision
-from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
     TornBodies,
 )
-from mortarbench.problems.feti.tearing import SubdomainMesh
 
 
 @dataclass(frozen=True, eq=False)
 class DecomposedLinearisation:
-    """Linearised contact problem of torn bodies; see `LinearisedProblem`.
-
-    All ranks must call its methods together; the results are equal on all ranks.
-    """
+    """Linearised contact problem of torn bodies; see `LinearisedProblem`."""
 
     bodies: UnassembledBodies
     served: Served
@@ -84,18 +81,15 @@ class DecomposedLinearisation:
 
     @cached_property
     def dual(self) -> TornDual:
-        """The dual on rank 0."""
+        """The dual."""
         return TornDual(self.served)
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
         """Solve the dual with the given friction bounds."""
-
-        def solution() -> Solution:
-            bounded = self.served.torn.with_bound(friction.bound)
-            sets = replace(self.dual, served=Served(bounded)).sets
-            return self.reference(replace(self.dual.qp, sets=sets), start)
-
-        return led(self.served.torn.comm, self.served, solution)
+        bounded = replace(
+            self.dual, served=Served(self.served.torn.with_bound(friction.bound))
+        )
+        return self.reference(replace(self.dual.qp, sets=bounded.sets), start)
 
     def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
@@ -103,20 +97,17 @@ class DecomposedLinearisation:
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (n,) and the normal forces (places,) of all slave nodes."""
-        u = led(self.served.torn.comm, self.served, lambda: self.dual.displacement(s))
-        self.served.forget()  # release the large explicit blocks
+        u = self.dual.displacement(s)
+        self.dual.qp.P.forget()  # release the large explicit blocks
         # negative multipliers of inexact solutions would be negative friction bounds
         normal = np.maximum(self.normal_multipliers(s), 0.0)
         return u, self.rows.at_places(normal, slave_places(self.bodies.pairs))
 
 
 def decomposed_path(
-    problem: ContactProblem, choice: Choice, comm: Comm, reference: ReferenceOfOperator
+    problem: ContactProblem, choice: Choice, team: Team, reference: ReferenceOfOperator
 ) -> LoadPath[DecomposedLinearisation]:
-    """Return the load path of a decomposed contact problem.
-
-    All ranks must call this function, and the methods of the path, together.
-    """
+    """Return the load path of a decomposed contact problem."""
     bodies, first = problem.bodies, list[TornBodies]()
     layout = subdivided(bodies.shape, choice.size)
     zero, places = np.zeros(bodies.mesh.dofs), slave_places(bodies.pairs)
@@ -127,11 +118,10 @@ def decomposed_path(
         friction = friction_of(
             bodies, rows, stage.laws, at.slip_origin, at.normal_forces
         )
-        # the QP is not stored, because every rank would have a copy
         contact = contact_of(_interface_qp(bodies, stage.fixed, rows), friction)
         parts = decompose(bodies, layout, choice.glue, stage, contact)
         if not first:
-            first.append(TornBodies(parts, comm))
+            first.append(TornBodies(parts, team))
         # the bodies are unchanged, so reuse their classes of subdomains
         served = Served(first[0].with_problem(parts))
         return DecomposedLinearisation(
@@ -163,9 +153,9 @@ def subdivided(shape: Shape, size: int) -> Subdivision:
 
 
 def case_on_ranks(
-    problem: ContactProblem, choice: Choice, comm: Comm, reference: ReferenceOfOperator
-) -> CaseOnRanks:
-    """Return the selected dual of decomposed bodies; all ranks call this together.
+    problem: ContactProblem, choice: Choice, team: Team, reference: ReferenceOfOperator
+) -> Case:
+    """Return the selected dual of decomposed bodies.
 
     Raises
     ------
@@ -179,51 +169,47 @@ def case_on_ranks(
             "prescribed displacements on MPI ranks are not built; expected no ranks, "
             "or supports without displacement"
         )
-    path = decomposed_path(problem, choice, comm, reference)
+    path = decomposed_path(problem, choice, team, reference)
     chosen = path.problem(choice.step)
     others = path.before(choice.step, chosen)
     count = path.iterates(choice.step)
     torn = chosen.problem.served.torn.with_bound(chosen.friction.bound)
-    served = Served(torn, partial(largest_stresses, torn, problem.bodies))
+    served = Served(torn)
     first = path.problems(0)[0].problem.served.torn if others else torn
     linearised = replace(chosen.problem, friction=chosen.friction)
+    dual, elastic = TornDual(served), problem.bodies
+    displacement = lru_cache(maxsize=1)(dual.displacement)
+    mechanics, bound = torn_mechanics(served), chosen.friction.bound
+    acts = np.append(np.ones(linearised.rows.c.size), bound) > 0
 
-    def case() -> Case:
-        dual, elastic = TornDual(served), problem.bodies
-        displacement = lru_cache(maxsize=1)(dual.displacement)
-        mechanics, bound = torn_mechanics(served), chosen.friction.bound
-        acts = np.append(np.ones(linearised.rows.c.size), bound) > 0
+    def results(s: Solution) -> Mapping[str, Any]:
+        u, parts = displacement(s), served.local_problems
+        state, v = interface_state(dual, linearised, u, s), parts.spread @ u
+        energy = float(v @ parts.product(v) / 2 - v @ torn.f)
+        largest = largest_stresses(torn, elastic, u)
+        return {
+            **quantities(*state, energy, largest),
+            **problem.results(ContactSolution(state, count)),
+            **decomposition_quantities(served, dual.qp),
+        }
 
-        def results(s: Solution) -> Mapping[str, Any]:
-            u, parts = displacement(s), served.local_problems
-            state, v = interface_state(dual, linearised, u, s), parts.spread @ u
-            energy = float(v @ parts.product(v) / 2 - v @ torn.f)
-            largest = served.lead("largest_stresses", u)
-            return {
-                **quantities(*state, energy, largest),
-                **problem.results(ContactSolution(state, count)),
-                **decomposition_quantities(served, dual.qp),
-            }
-
-        return Case(
-            qp=dual.qp,
-            digest=digest_of(served, first, others),
-            recover=lambda s: displacement(s) * elastic.length,
-            quantities=results,
-            certifiable=lambda s: (
-                mechanics(),
-                displacement(s),
-                dual.multipliers(s)[acts],
-            ),
-        )
-
-    return CaseOnRanks(served, case)
+    return Case(
+        qp=dual.qp,
+        digest=digest_of(served, first, others),
+        recover=lambda s: displacement(s) * elastic.length,
+        quantities=results,
+        certifiable=lambda s: (
+            mechanics(),
+            displacement(s),
+            dual.multipliers(s)[acts],
+        ),
+    )
 
 
 def interface_state(
     dual: TornDual, at: DecomposedLinearisation, u: Vector, s: Solution
 ) -> InterfaceState:
-    """Return the state of the contact interface on rank 0.
+    """Return the state of the contact interface.
 
     u : (n,) nondimensional displacement
     s : solution of the dual
@@ -325,54 +311,34 @@ def longitudinal_share(D: NDArray[np.float64]) -> Vector:
     return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, -1, -1]))
 
 
-def elastic_class(
-    part: SubdomainMesh, D: NDArray[np.float64], E: Vector
-) -> SubdomainClass:
-    """Return the class of a floating elastic subdomain, with its assembled stiffness.
-
-    Parameters
-    ----------
-    D : (k, v, v) elasticity matrices of the materials, nondimensional
-    E : (k,) Young's moduli of the materials, nondimensional
-
-    """
-    cells, dim = part.cells, part.points.shape[1]
-    around = np.bincount(cells.ravel(), np.repeat(E[part.material], cells.shape[1]))
-    return SubdomainClass(
-        K=stiffness(Mesh(part.points, cells, {}), D, part.material),
-        R=rigid_modes(part.points),
-        fixing=dofs_of(fixing_nodes(part.points), dim),
-        boundary=dofs_of(np.unique(boundary_facets(cells, dim)), dim),
-        stiffness=np.repeat(around / np.bincount(cells.ravel()), dim),
-    )
-
-
-#: number of layers of cells around a node on which its recovered stress may depend
-STRESS_LAYERS = 3
-
-
 def largest_stresses(torn: TornBodies, elastic: UnassembledBodies, u: Vector) -> Vector:
-    """Return the largest nodal von Mises stress of each body on this rank, Pa.
+    """Return the largest nodal von Mises stress of each body, Pa.
+
+    Each rank evaluates the nodes of its subdomains.
 
     u : (n,) nondimensional displacement
     """
-    materials, plane = elastic.materials, elastic.plane
-    layout, D = torn.problem.layout, elasticity_matrices(materials, plane)
-    points, cells = layout.mesh.points, layout.mesh.cells
-    own = torn.domains.rank[layout.label] == torn.comm.rank
-    u, largest = as_vectors(u * elastic.length, layout.mesh.dim), np.zeros(len(D))
-    for b, material in enumerate(materials):
+    materials, layout, plane = elastic.materials, torn.problem.layout, elastic.plane
+    points, cells, D = (
+        layout.mesh.points,
+        layout.mesh.cells,
+        elasticity_matrices(materials, plane),
+    )
+    rank, u = torn.rank[layout.label], as_vectors(u * elastic.length, layout.mesh.dim)
+
+    def patch(own: int, b: int) -> Patch:
         of_body = layout.body_of_cell == b
-        inner = np.zeros(len(points), dtype=bool)
-        inner[cells[own & of_body]] = True
-        near = inner.copy()
+        is_inside = np.zeros(len(points), dtype=bool)
+        is_inside[cells[of_body & (rank == own)]] = True
+        near = is_inside.copy()
         for _ in range(STRESS_LAYERS):
             selected = of_body & near[cells].any(axis=1)
             near[cells[selected]] = True
-        node = np.flatnonzero(near)
-        if not node.size:
-            continue
-        part = Mesh(points[node], np.cumsum(near)[cells[selected]] - 1, {})
-        stress = recover(part, centre_stress(part, D[b], u[node].ravel()))[inner[node]]
-        largest[b] = von_mises(stress, material.nu, plane).max()
-    return largest
+        local = np.cumsum(near)[cells[selected]] - 1
+        return Patch(
+            points[near], local, u[near], is_inside[near], D[b], materials[b].nu, plane
+        )
+
+    ranks, bodies = range(torn.team.comm.size), range(len(materials))
+    patches = [[patch(own, b) for b in bodies] for own in ranks]
+    return np.asarray(np.max(torn.team.map(largest_in_patches, patches), axis=0))

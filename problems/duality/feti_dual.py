@@ -35,9 +35,9 @@ from mortarbench.problems.feti.subdomains import TornBodies
 
 @dataclass(frozen=True, eq=False)
 class TornDual:
-    """The dual of torn bodies, on rank 0."""
+    """The dual of torn bodies."""
 
-    served: Served  #: objects on rank 0
+    served: Served
 
     @property
     def torn(self) -> TornBodies:
@@ -47,13 +47,12 @@ class TornDual:
     @cached_property
     def free(self) -> Vector:
         """K⁺f (N,), the displacement without multipliers."""
-        return np.asarray(self.served.lead("domains.inverse", self.torn.f))
+        return self.torn.apply("inverse", self.torn.f)
 
     @property
     def R(self) -> csr_array:
         """Rigid motions (N, r) of all subdomains; not stored, since they are large."""
-        kernel: csr_array = self.served.lead("domains.kernel")
-        return kernel
+        return self.torn.kernel()
 
     @property
     def sets(self) -> tuple[ConvexSet, ...]:
@@ -83,7 +82,7 @@ class TornDual:
         RᵀBᵀλ = Rᵀf. At the solution, all copies are equal.
         """
         B, T, f = self.torn.rows.B, self.torn.spread, self.torn.f
-        v = self.served.lead("domains.inverse", f - B.T @ s.x) - self.R @ s.y
+        v = self.torn.apply("inverse", f - B.T @ s.x) - self.R @ s.y
         copies = np.bincount(self.torn.component, minlength=T.shape[1])
         return np.asarray((T.T @ v) / copies)
 
@@ -133,7 +132,9 @@ def digest_of(served: Served, torn: TornBodies, others: int = 0) -> str:
     (B, c, _), bound = torn.rows, torn.problem.contact.bound
     arrays = (torn.domains.class_of, B.indptr, B.indices, B.data, c, torn.f, bound)
     data = (x.tobytes() for x in arrays)
-    return hex_digest((*served.lead("domains.names"), *data, str(others).encode()), 16)
+    name_of = {k: name for own in served.torn.parts("names") for k, name in own.items()}
+    names = (name_of[k].encode() for k in sorted(name_of))
+    return hex_digest((*names, *data, str(others).encode()), 16)
 
 
 def feti_matrices(served: Served, dual: QP) -> dict[str, Any]:
@@ -144,7 +145,7 @@ def feti_matrices(served: Served, dual: QP) -> dict[str, Any]:
     if isinstance(dual.P, OperatorOnRanks):
         return {}
     B, c, _ = served.torn.rows
-    return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": served.domains.kernel()}
+    return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": served.torn.kernel()}
 
 
 def decomposition_quantities(served: Served, dual: QP) -> dict[str, Any]:
@@ -160,7 +161,7 @@ def decomposition_quantities(served: Served, dual: QP) -> dict[str, Any]:
     * `explicit_mib`: memory for these blocks, MiB, stored once
     """
     domains, B = served.domains, served.torn.rows.B
-    explicit = served.operator.explicit
+    explicit = served.explicit
     sizes = np.array([part.size for part in touched_components(B, domains)])
     return {
         "subdomains": domains.class_of.size,

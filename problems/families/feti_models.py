@@ -29,14 +29,15 @@ from mortarbench.harness import (
     InputError,
     Mechanics,
     Reference,
+    ReferenceOfOperator,
     Solution,
     Vector,
     no_rows,
 )
+from mortarbench.harness.distributed.comm import Team
 from mortarbench.harness.keys import Range
 from mortarbench.harness.mechanics import DecomposedMechanics
 from mortarbench.problems.contact.sides import active
-from mortarbench.problems.duality.decomposed import elastic_class
 from mortarbench.problems.duality.dualisation import (
     Transformed,
     dual_bounds,
@@ -77,8 +78,9 @@ from mortarbench.problems.fem.mesh import (
     rectangle,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
+from mortarbench.problems.feti.elastic import elastic_class
 from mortarbench.problems.feti.mechanics import torn_mechanics
-from mortarbench.problems.feti.served import Served, case_of_torn
+from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.spectrum import Spectrum, spectra
 from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
@@ -150,7 +152,7 @@ class DecomposedFamily(Family):
         return replace(case, dualise_seconds=perf_counter() - start)
 
     def decomposed_case(self, served: Served) -> Case:
-        """Return the case of the dual in subdomains on rank 0."""
+        """Return the case of the dual in subdomains."""
         new = feti_dual(served, self.qp)
         case = self.case(new, torn_mechanics(served, self.qp.P))
         sizes = decomposition_quantities(served, new.qp)
@@ -166,7 +168,10 @@ class DecomposedFamily(Family):
         if form != "dual" or not self.is_divided:
             return None
         problem = self.in_subdomains()
-        build = partial(case_of_torn, problem, self.decomposed_case)
+
+        def build(team: Team, _: ReferenceOfOperator) -> Case:
+            return self.decomposed_case(Served(TornBodies(problem, team)))
+
         return Divided(problem.layout.count, build)
 
 

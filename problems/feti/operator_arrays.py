@@ -69,7 +69,6 @@ def dual_operator_from_arrays(arrays: Arrays) -> DualOperator:
         template=classes.__getitem__,
         sizes=sizes,
         class_of=arrays["kind"],
-        rank=np.zeros(arrays["kind"].size, dtype=np.int64),
     )
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)

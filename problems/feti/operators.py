@@ -38,8 +38,8 @@ face.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,10 +81,7 @@ COUPLING_ROUNDING = 1e-12
 
 
 class Group(NamedTuple):
-    """Subdomains of one class on this rank, with the components that B touches.
-
-    The components are those that B touches in any subdomain of the class on any rank.
-    """
+    """Subdomains of one class, with the components that B touches in any of them."""
 
     template: SubdomainClass
     explicit: bool  #: True if (K⁺)_bb is computed in advance
@@ -147,24 +144,31 @@ class Packed:
         return total
 
 
-def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
-    """Pack the columns of B (m, N) that this rank touches, class by class.
+def pack(
+    B: csr_array,
+    domains: Subdomains,
+    explicit: NDArray[np.bool_],
+    touched: Sequence[Nodes],
+) -> Packed:
+    """Pack the columns of B (m, N) with nonzeros, class by class.
 
+    The groups have classes of their own, so that their factors are computed anew.
+
+    Parameters
+    ----------
     explicit : (classes,) True for classes with explicit blocks
+    touched : for each class, components that include those that B touches
+
     """
-    groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
-    parts = touched_components(B, domains)
-    for k, members in domains.own:
-        groups.append(Group(domains.template(k), bool(explicit[k]), members, parts[k]))
-        unknowns = domains.start[members] + parts[k][:, None]
+    groups, number, end = [], np.empty(B.shape[1], dtype=np.int64), 0
+    for k, members in domains.members:
+        template = replace(domains.template(k))
+        groups.append(Group(template, bool(explicit[k]), members, touched[k]))
+        unknowns = domains.start[members] + touched[k][:, None]
         number[unknowns.ravel()] = np.arange(end, end + unknowns.size)
         end += unknowns.size
-    places = number[B.indices]
-    here = places >= 0  # columns of other processes are dropped
-    ends = np.concatenate([[0], np.cumsum(here)])[B.indptr]
-    indices = places[here].astype(B.indices.dtype)
-    packed = (B.data[here], indices, ends.astype(B.indptr.dtype))
-    B_b = csr_array(packed, shape=(B.shape[0], end))
+    indices = number[B.indices].astype(B.indices.dtype)
+    B_b = csr_array((B.data, indices, B.indptr), shape=(B.shape[0], end))
     return Packed(tuple(groups), B_b, csr_array(B_b.T))
 
 
@@ -189,8 +193,8 @@ def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
 class DualOperator:
     """The operator F of decomposed bodies, applied to arrays (m,) or (m, k).
 
-    On several processes, each applies the part of its subdomains. All of them must call
-    each method together, and the results are valid on rank 0 (`OperatorOnRanks`).
+    On several ranks, each rank has the operator of its own subdomains, and F is the sum
+    of these operators (`problems.feti.served`).
     """
 
     B: csr_array  #: (m, N) rows on all torn unknowns
@@ -198,20 +202,28 @@ class DualOperator:
     explicit: NDArray[np.bool_]  #: (classes,) True for classes with explicit blocks
     equalities: int  #: number of equality rows, which come first; contact rows follow
     semidefinite: bool = False  #: True if Fλ = 0 for some λ ≠ 0: redundant rows
+    #: for each class, the components that B touches in any subdomain, on all ranks;
+    #: None if there is one rank
+    touched: Sequence[Nodes] | None = None
 
     def __call__(self, x: Dense) -> Dense:
         """Return Fx."""
-        return self.domains.sum(self.linear_map(x))
+        return np.asarray(self.linear_map(x))
 
     @cached_property
     def linear_map(self) -> Composition:
-        """The part of F of this rank as a composition of compiled linear maps."""
+        """F as a composition of compiled linear maps."""
         inverses = self.packed.block_diagonal(self._blocks[0])
         return self.packed.congruence(inverses)
 
     def prepare(self) -> None:
-        """Factorise the subdomains of this rank."""
+        """Factorise the subdomains."""
         _ = self.linear_map
+
+    def forget(self) -> None:
+        """Discard all factors; the next product computes them again."""
+        for name in ("linear_map", "packed", "_blocks", "_diagonal", "_weighted"):
+            vars(self).pop(name, None)
 
     def diagonal(self) -> Vector:
         """Return the diagonal of F, (m,)."""
@@ -219,8 +231,6 @@ class DualOperator:
 
     def preconditioner(self, kind: str, scaling: str) -> LinearMap:
         """Return the map x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for x (m,) or (m, k).
-
-        On several processes, this is the map `outer` of `preconditioner_parts` only.
 
         Parameters
         ----------
@@ -233,43 +243,36 @@ class DualOperator:
             If `kind` or `scaling` is not one of these names.
 
         """
-        outer, inner = self.preconditioner_parts(kind, scaling)
-        return Composition(outer, inner, outer)
+        inverse, outer = gram_inverses(self.gram(kind, scaling), self.equalities)
+        self.weigh(kind, scaling, inverse)
+        return Composition(outer, self._weighted[kind, scaling], outer)
 
-    def precondition(self, kind: str, scaling: str, x: Dense) -> Dense:
-        """Apply the map `inner` of `preconditioner_parts` of all processes."""
-        inner = self.preconditioner_parts(kind, scaling)[1]
-        return self.domains.sum(inner(x))
+    def gram(self, kind: str, scaling: str) -> csr_array:
+        """Return B W Bᵀ, (m, m)."""
+        _, weights = self.weighted_blocks(kind, scaling)
+        return csr_array(self.packed.B @ diags_array(weights) @ self.packed.BT)
 
-    def preconditioner_parts(
-        self, kind: str, scaling: str
-    ) -> tuple[LinearMap, LinearMap]:
-        """Return two maps with B_D diag(D) B_Dᵀ = outer · inner · outer.
+    def weigh(self, kind: str, scaling: str, inverse: csr_array) -> None:
+        """Define the map that `weighted` applies.
 
-        outer : applies (B W Bᵀ)⁻¹ to contact rows, for which it is dense
-        inner : contribution of the subdomains of this rank
+        inverse : (B W Bᵀ)⁺ of equality rows, as sparse as B
         """
-        if (kind, scaling) not in self._preconditioners:
-            blocks, weights = self.weighted_blocks(kind, scaling)
-            packed, E = self.packed, self.equalities
-            BW = csr_array(packed.B @ diags_array(weights))
-            # (B W Bᵀ)⁺ is as sparse as B for equality rows
-            inverse, contact = self.domains.evaluated(
-                partial(gram_inverses, equalities=E), csr_array(BW @ packed.BT)
-            )
-            B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
-            inner = Composition(
-                CompressedRows(B_D),
-                packed.block_diagonal(blocks),
-                CompressedRows(csr_array(B_D.T)),
-            )
-            none = np.zeros(0, dtype=np.int64)
-            outer = DirectSum(Identity(E), bordered_factor(contact, none))
-            self._preconditioners[kind, scaling] = outer, inner
-        return self._preconditioners[kind, scaling]
+        blocks, weights = self.weighted_blocks(kind, scaling)
+        packed, E = self.packed, self.equalities
+        BW = csr_array(packed.B @ diags_array(weights))
+        B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
+        self._weighted[kind, scaling] = Composition(
+            CompressedRows(B_D),
+            packed.block_diagonal(blocks),
+            CompressedRows(csr_array(B_D.T)),
+        )
+
+    def weighted(self, kind: str, scaling: str, x: Dense) -> Dense:
+        """Apply B_D diag(D) B_Dᵀ without the inverse for contact rows."""
+        return np.asarray(self._weighted[kind, scaling](x))
 
     @cached_property
-    def _preconditioners(self) -> dict[tuple[str, str], tuple[LinearMap, LinearMap]]:
+    def _weighted(self) -> dict[tuple[str, str], Composition]:
         return {}
 
     def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
@@ -304,12 +307,13 @@ class DualOperator:
 
     @cached_property
     def packed(self) -> Packed:
-        """Rows of B restricted to the components they touch on this rank."""
-        return pack(self.B, self.domains, self.explicit)
+        """Rows of B restricted to the components that they touch."""
+        touched = self.touched or touched_components(self.B, self.domains)
+        return pack(self.B, self.domains, self.explicit, touched)
 
     @cached_property
     def _diagonal(self) -> Vector:
-        return self.domains.sum(self.packed.diagonal(self._blocks[0]))
+        return self.packed.diagonal(self._blocks[0])
 
     @cached_property
     def _blocks(self) -> tuple[list[Any], list[Any]]:
@@ -378,17 +382,18 @@ def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
     return csr_array(parts, shape=gram.shape)
 
 
-def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, csc_array]:
-    """Return (B W Bᵀ)⁺ of equality rows, and the block B W Bᵀ of contact rows.
+def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, LinearMap]:
+    """Return (B W Bᵀ)⁺ of equality rows, and a map with the inverse for contact rows.
 
-    The block is made regular by `CONTACT_SHIFT`.
+    The block of contact rows is made regular by `CONTACT_SHIFT`. The map leaves
+    equality rows unchanged.
     """
     gram = decouple_contact(gram, equalities)
     inverse = block_pseudoinverse(gram[:equalities, :equalities])
     contact = csc_array(gram[equalities:, equalities:])
-    return inverse, csc_array(
-        contact + diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
-    )
+    contact += diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
+    factor = bordered_factor(contact, np.zeros(0, dtype=np.int64))
+    return inverse, DirectSum(Identity(equalities), factor)
 
 
 def block_pseudoinverse(M: csr_array) -> csr_array:

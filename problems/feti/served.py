@@ -1,119 +1,80 @@
-"""Objects of torn bodies that exist on every rank, and their use from rank 0."""
+"""The dual operator and the local problems of torn bodies, on one or several ranks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
-from types import SimpleNamespace
-from typing import Any, cast
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator
 
-from mortarbench.harness import Case, CaseOnRanks, ReferenceOfOperator, Vector
-from mortarbench.harness.distributed.comm import Comm, Lead
-from mortarbench.harness.mechanics import Substructures
+from mortarbench.harness import Vector
+from mortarbench.harness.distributed.comm import Placed
 from mortarbench.harness.operators import Product, SerialisableOperator
+from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.operator_arrays import dual_operator
-from mortarbench.problems.feti.operators import DualOperator, explicit_classes
+from mortarbench.problems.feti.operators import (
+    DualOperator,
+    explicit_classes,
+    gram_inverses,
+    touched_components,
+)
 from mortarbench.problems.feti.subdomain_classes import Dense, Subdomains
-from mortarbench.problems.feti.subdomains import DecomposedProblem, TornBodies
+from mortarbench.problems.feti.subdomains import TornBodies
 from mortarbench.problems.feti.substructures import LocalProblems
 
 
 @dataclass(eq=False)
 class Served:
-    """Objects of torn bodies whose methods rank 0 calls on all ranks.
-
-    Methods and attributes must be called by all ranks together, and their results are
-    valid on rank 0. Rank 0 calls them by `lead`.
-    """
+    """Operators of torn bodies; on several ranks, on rank 0."""
 
     torn: TornBodies
-    #: map from a displacement (n,) to the largest stress of each body on this rank
-    stresses: Callable[[Vector], Vector] | None = None
-
-    def __post_init__(self) -> None:
-        """Let the ranks agree on their subdomains, and compute the rows of B."""
-        _ = self.torn.rows
-        self.lead = Lead(self.torn.comm, self)
 
     @property
     def domains(self) -> Subdomains:
-        """The subdomains."""
+        """The subdomains of all ranks."""
         return self.torn.domains
 
     @cached_property
-    def operator(self) -> DualOperator:
-        """The dual operator F; it computes its own factors."""
-        domains, rows = self.torn.domains, self.torn.rows
-        unfactored = cache(lambda k: replace(domains.template(k)))
-        return DualOperator(
-            rows.B,
-            replace(domains, template=unfactored),
-            explicit_classes(rows.B, domains),
-            rows.equalities,
-            self.torn.problem.redundant,
-        )
+    def explicit(self) -> NDArray[np.bool_]:
+        """Mask (classes,) of the classes with explicit blocks."""
+        return explicit_classes(self.torn.rows.B, self.domains)
 
     @cached_property
-    def parts(self) -> LocalProblems:
+    def operator(self) -> DualOperator:
+        """The dual operator F on one process; it computes its own factors."""
+        (B, _, equalities), redundant = self.torn.rows, self.torn.problem.redundant
+        return DualOperator(B, self.domains, self.explicit, equalities, redundant)
+
+    @cached_property
+    def local_problems(self) -> LocalProblems:
         """The local problems for certificates; supports are rows of B."""
         return LocalProblems(self.torn)
 
-    @cached_property
-    def local_problems(self) -> Substructures:
-        """The local problems on rank 0; on several ranks, methods call all ranks."""
-        if self.torn.comm.size == 1:
-            return self.parts
-        methods = ("diagonal", "product", "squared_product", "solve")
-        on_ranks: Any = SimpleNamespace(
-            spread=self.parts.spread,
-            kernel=self.lead("parts.torn.domains.kernel"),
-            weight=self.lead("weights"),
-            **{name: partial(self.lead, f"parts.{name}") for name in methods},
-        )
-        return cast(Substructures, on_ranks)
-
-    def weights(self) -> Vector:
-        """Return the weights of the local problems, (N,)."""
-        return self.parts.weight
-
-    def largest_stresses(self, u: Vector) -> Vector:
-        """Return the largest stress of each body, (bodies,), Pa.
-
-        u : (n,) nondimensional displacement
-        """
-        assert self.stresses is not None
-        comm = self.torn.comm
-        largest = comm.gather(comm.together(partial(self.stresses, u)))
-        return np.max(largest, axis=0) if largest else np.zeros(0)
-
-    def forget(self) -> None:
-        """Discard the factors of the dual operator."""
-        vars(self).pop("operator", None)
-
-
-def case_of_torn(
-    problem: DecomposedProblem,
-    case: Callable[[Served], Case],
-    comm: Comm,
-    _: ReferenceOfOperator,
-) -> CaseOnRanks:
-    """Return a case that needs no previous solutions; all ranks call this together.
-
-    case : returns the case on rank 0
-    """
-    served = Served(TornBodies(problem, comm))
-    return CaseOnRanks(served, partial(case, served))
-
 
 def operator_of(served: Served) -> SerialisableOperator | OperatorOnRanks:
-    """Return the dual operator on rank 0; on one process, it can be stored in files."""
-    if served.torn.comm.size == 1:
+    """Return the dual operator; on one process, it can be stored in files."""
+    if served.torn.team.comm.size == 1:
         return dual_operator(served.operator)
     return OperatorOnRanks(served)
+
+
+class LocalRows(NamedTuple):
+    """Data of the dual operator on one rank, see `DualOperator`."""
+
+    B: csr_array  #: (m, N_r) columns of the unknowns of this rank
+    explicit: NDArray[np.bool_]
+    equalities: int
+    semidefinite: bool
+    touched: list[Nodes]
+
+
+def local_operator(rows: LocalRows, domains: Subdomains) -> DualOperator:
+    """Return the dual operator of the subdomains of one rank."""
+    return DualOperator(rows.B, domains, *rows[1:])
 
 
 class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no types
@@ -123,35 +84,46 @@ class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no typ
     """
 
     def __init__(self, served: Served) -> None:
-        m = served.operator.B.shape[0]
-        super().__init__(np.dtype(float), (m, m))
-        self._served = served
-        self.semidefinite = served.operator.semidefinite
+        torn = served.torn
+        B, _, self._equalities = torn.rows
+        super().__init__(np.dtype(float), (B.shape[0],) * 2)
+        self.semidefinite = torn.problem.redundant
+        same = (
+            served.explicit,
+            self._equalities,
+            self.semidefinite,
+            touched_components(B, torn.domains),
+        )
+        ends = zip(torn.ends[:-1], torn.ends[1:], strict=True)
+        rows = [LocalRows(csr_array(B[:, a:b]), *same) for a, b in ends]
+        self._parts: Placed = torn.team.place(local_operator, rows, torn.parts)
 
     def build(self) -> OperatorOnRanks:
         """Factorise the subdomains on all ranks."""
-        self._served.lead("operator.prepare")
+        self._parts("prepare")
         return self
 
     def forget(self) -> None:
         """Discard all factors; the next product computes them again."""
-        self._served.lead("forget")
+        self._parts("forget")
 
     def diagonal(self) -> Vector:
         """Return the diagonal of F, (m,)."""
-        return np.asarray(self._served.lead("operator.diagonal"))
+        return self._parts.total("diagonal")
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
-        outer, _ = self._served.lead("operator.preconditioner_parts", kind, scaling)
-        inner = partial(self._served.lead, "operator.precondition", kind, scaling)
+        first, *others = self._parts("gram", kind, scaling)
+        inverse, outer = gram_inverses(sum(others, start=first), self._equalities)
+        self._parts("weigh", kind, scaling, inverse)
+        inner = partial(self._parts.total, "weighted", kind, scaling)
         return lambda x: outer(inner(outer(x)))
 
     def _matvec(self, x: Vector) -> Vector:
-        return np.asarray(self._served.lead("operator", x))
+        return self._parts.total("__call__", x)
 
     def _matmat(self, X: Dense) -> Dense:
-        return np.asarray(self._served.lead("operator", X))
+        return self._parts.total("__call__", X)
 
     def _adjoint(self) -> OperatorOnRanks:
         return self

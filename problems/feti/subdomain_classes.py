@@ -14,11 +14,10 @@ block per copy of a node.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +27,15 @@ from sksparse.cholmod import Factor, analyze, cholesky
 
 from mortarbench.harness import Vector
 from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.distributed.comm import SERIAL, Comm
 from mortarbench.harness.distributed.factor import with_int32
+from mortarbench.harness.mechanics import in_precision
 from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.tearing import SubdomainMesh
 
 Dense = NDArray[np.float64]
-T = TypeVar("T")
+#: number of subdomains whose products are computed at a time, so that their vectors
+#: stay in the cache
+STRIP_COLUMNS = 32
 _STRIP = 256  #: right-hand sides per solve; bounds the memory for the solutions
 
 
@@ -160,21 +162,44 @@ class Elimination(NamedTuple):
         return SX
 
 
+class Assembly:
+    """Classes of subdomains by number, each assembled on its first use.
+
+    mesh : returns the mesh of a subdomain of a class
+    assemble : assembles the class of a floating subdomain
+    """
+
+    def __init__(
+        self,
+        mesh: Callable[[int], SubdomainMesh],
+        assemble: Callable[[SubdomainMesh], SubdomainClass],
+    ) -> None:
+        self.mesh, self._assemble = mesh, assemble
+        self._classes: dict[int, SubdomainClass] = {}
+
+    def __call__(self, k: int) -> SubdomainClass:
+        """Return class k."""
+        if k not in self._classes:
+            self._classes[k] = self._assemble(self.mesh(k))
+        return self._classes[k]
+
+    def selected(self, classes: Iterable[int]) -> Assembly:
+        """Return an assembly of some classes, which can be sent to another rank."""
+        meshes = {k: self.mesh(k) for k in classes}
+        return Assembly(meshes.__getitem__, self._assemble)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Subdomains:
-    """S subdomains before gluing, grouped into classes and distributed over ranks.
+    """S subdomains before gluing, grouped into classes.
 
-    Each rank assembles and factorises the classes of its own subdomains. Methods that
-    involve these matrices must be called by all ranks together; their results are valid
-    on rank 0.
+    On several ranks, each rank has the object of its own subdomains.
     """
 
     #: map from the number of a class to the class, which the first call assembles
     template: Callable[[int], SubdomainClass]
     sizes: NDArray[np.int64]  #: (classes,) number of torn unknowns of a subdomain
     class_of: NDArray[np.int64]  #: (S,) class of each subdomain
-    rank: NDArray[np.int64]  #: (S,) rank of each subdomain, ascending
-    comm: Comm = SERIAL
 
     @cached_property
     def start(self) -> NDArray[np.int64]:
@@ -182,64 +207,30 @@ class Subdomains:
         return np.concatenate([[0], np.cumsum(self.sizes[self.class_of])])
 
     @cached_property
-    def own(self) -> tuple[tuple[int, NDArray[np.int64]], ...]:
-        """Classes that occur on this rank, each with its subdomains on this rank."""
-        own = np.flatnonzero(self.rank == self.comm.rank)
-        order = own[np.argsort(self.class_of[own], kind="stable")]
+    def members(self) -> tuple[tuple[int, NDArray[np.int64]], ...]:
+        """Classes that occur, each with its subdomains."""
+        order = np.argsort(self.class_of, kind="stable")
         classes, first = np.unique(self.class_of[order], return_index=True)
         return tuple(zip(classes.tolist(), np.split(order, first[1:]), strict=True))
 
     def places(self) -> Iterator[tuple[SubdomainClass, NDArray[np.int64]]]:
-        """Yield the classes on this rank with the unknowns of their subdomains.
+        """Yield the classes with the unknowns of their subdomains.
 
-        The unknowns (n_k, S_k) have a column for each subdomain on this rank.
+        The unknowns (n_k, S_k) have a column for each subdomain.
         """
-        for k, members in self.own:
+        for k, members in self.members:
             yield (
                 self.template(k),
                 self.start[members] + np.arange(self.sizes[k])[:, None],
             )
 
-    def names(self) -> list[bytes]:
-        """Return the digests of all classes."""
-        own = {k: self.template(k).name.encode() for k, _ in self.own}
-        every = {k: name for one in self.comm.gather(own) for k, name in one.items()}
-        return [every[k] for k in sorted(every)]
+    def names(self) -> dict[int, str]:
+        """Return the digests of all classes that occur."""
+        return {k: self.template(k).name for k, _ in self.members}
 
-    def kernel(self) -> csr_array:
-        """Return R = diag(R_1 … R_S) (N, r), the rigid motions of all subdomains."""
-        blocks = self.comm.gather({k: self.template(k).R for k, _ in self.own})
-        R_of = {k: R for one in blocks for k, R in one.items()}
-        if not R_of:
-            return csr_array((0, 0))
-        of = [R_of[k] for k in self.class_of.tolist()]
-        modes, size = np.array([R_s.shape[1] for R_s in of]), np.diff(self.start)
-        # numbers of entries and first columns of all rows
-        width, first = (np.repeat(v, size) for v in (modes, np.cumsum(modes) - modes))
-        ends = np.append(0, np.cumsum(width)).astype(np.int32)
-        column = np.arange(ends[-1], dtype=np.int32)
-        column += np.repeat((first - ends[:-1]).astype(np.int32), width)
-        data = np.concatenate([R_s.ravel() for R_s in of])
-        R = csr_array((data, column, ends), shape=(size.sum(), modes.sum()))
-        R.eliminate_zeros()
-        return R
-
-    def sum(self, part: NDArray[Any]) -> NDArray[Any]:
-        """Return the sum of the contributions of all ranks, on rank 0."""
-        return self.comm.sum(part)
-
-    def evaluated(self, work: Callable[[Any], T], part: Any) -> T:
-        """Return `work` of the sum of a sparse matrix over all ranks, on every rank."""
-        parts = self.comm.gather(part)
-        result: Any = work(sum(parts[1:], start=parts[0])) if parts else None
-        shared: T = self.comm.bcast(result)
-        return shared
-
-    def combined(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Complete a torn vector (N,) with the subdomains of the other ranks."""
-        first = np.searchsorted(self.rank, np.arange(self.comm.size + 1))
-        self.comm.fill(v, [slice(*ends) for ends in pairwise(self.start[first])])
-        return v
+    def modes(self) -> dict[int, Dense]:
+        """Return the rigid motions R_k (n_k, r) of all classes that occur."""
+        return {k: self.template(k).R for k, _ in self.members}
 
     def inverse(self, b: Vector) -> Vector:
         """Apply K⁺ to a torn vector (N,)."""
@@ -248,7 +239,60 @@ class Subdomains:
             columns = b[places]
             if columns.any():
                 v[places] = template.inverse(columns)
-        return self.combined(v)
+        return v
+
+    def product(self, v: NDArray[Any]) -> NDArray[Any]:
+        """Apply PKP to v (N,) in the precision of v.
+
+        P is the orthogonal projector that removes rigid motions.
+        """
+        image = np.zeros_like(v)
+        for template, every in self.places():
+            K, R = in_precision(template.K, v.dtype), template.R
+            for first in range(0, every.shape[1], STRIP_COLUMNS):
+                place = every[:, first : first + STRIP_COLUMNS]
+                place = place[:, (v[place] != 0).any(axis=0)]  # PKP maps zero to zero
+                columns = v[place]
+                columns -= R @ (R.T @ columns)
+                columns = K @ columns
+                columns -= R @ (R.T @ columns)
+                image[place] = columns
+        return image
+
+    def squared_product(self, v: Vector) -> Vector:
+        """Apply K∘K, the squares of the entries of K, to v (N,)."""
+        image = np.zeros_like(v)
+        for template, place in self.places():
+            image[place] = template.K.power(2) @ v[place]
+        return image
+
+    def solve(self, b: Vector) -> Vector:
+        """Apply PK⁺P, with P of `product`, to b (N,).
+
+        The systems of all subdomains of a class where b is nonzero are solved at once,
+        with one column of the right-hand side for each of these subdomains.
+        """
+        solution = np.zeros_like(b)
+        for template, place in self.places():
+            place = place[:, b[place].any(axis=0)]  # the solution is zero where b = 0
+            columns, R = b[place], template.R
+            columns -= R @ (R.T @ columns)
+            image = template.inverse(columns)
+            image -= R @ (R.T @ image)
+            solution[place] = image
+        return solution
+
+    def nodal_blocks(self, d: int) -> Dense:
+        """Return the diagonal block of K for each node, (N, d), by rows.
+
+        d : number of components of a node
+        """
+        blocks = np.empty((self.start[-1], d))
+        for template, place in self.places():
+            for i, j in np.ndindex(d, d):
+                diagonal = template.K.diagonal(j - i)[min(i, j) :: d]
+                blocks[place[i::d], j] = diagonal[:, None]
+        return blocks
 
 
 def upper_triangle(M: Dense) -> Vector:

@@ -1,9 +1,8 @@
 """Torn bodies: subdomains with their copies of nodes, and the rows B that join them.
 
-All ranks compute the numbers of the copies, the classes of congruent subdomains and the
+Rank 0 computes the numbers of the copies, the classes of congruent subdomains and the
 rows of B. These take little time compared with the matrices of the subdomains, which
-each rank assembles for its own subdomains only
-(`problems.feti.subdomain_classes.Subdomains`).
+each rank assembles for its own subdomains (`TornBodies.parts`).
 
 B consists of support, gluing and contact rows, in this order (Total FETI, Dostál, Horák
 and Kučera 2006). Every copy of a fixed component has a support row. The m copies
@@ -26,18 +25,18 @@ may be multiplied by a factor for the shape of the cells (`problems.feti.structu
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.comm import SERIAL, Comm
+from mortarbench.harness.distributed.comm import Placed, Team
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.subdivision import (
     Integers,
@@ -45,10 +44,16 @@ from mortarbench.problems.feti.subdivision import (
     Subdivision,
     TornNodes,
 )
-from mortarbench.problems.feti.subdomain_classes import SubdomainClass, Subdomains
+from mortarbench.problems.feti.subdomain_classes import (
+    Assembly,
+    Dense,
+    SubdomainClass,
+    Subdomains,
+)
 from mortarbench.problems.feti.tearing import SubdomainMesh, classify
 
 Weights = Callable[[int], NDArray[np.float64]]
+T = TypeVar("T")
 
 
 def _orthonormal(m: int) -> NDArray[np.float64]:
@@ -68,7 +73,7 @@ GLUE: Mapping[str, Weights] = MappingProxyType(
 
 
 class Contact(NamedTuple):
-    """Global contact rows followed by friction rows, replicated on every rank."""
+    """Global contact rows followed by friction rows."""
 
     rows: csr_array  #: (m_I, n) rows in components of the undivided bodies
     c: Vector  #: (m_I,) right-hand side
@@ -141,10 +146,14 @@ class Entries(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TornBodies:
-    """Decomposed bodies; most properties are evaluated on first use."""
+    """Decomposed bodies; most properties are evaluated on first use.
+
+    On several ranks, this object exists on rank 0, and the other ranks have only their
+    subdomains.
+    """
 
     problem: DecomposedProblem
-    comm: Comm = SERIAL
+    team: Team = field(default_factory=Team)
 
     @property
     def nodes(self) -> TornNodes:
@@ -159,19 +168,15 @@ class TornBodies:
 
     @cached_property
     def spread(self) -> csr_array:
-        """T (N, n), which maps displacements to torn unknowns in subdomain axes."""
-        return self.spread_to(slice(None))
-
-    def spread_to(self, nodes: Nodes | slice) -> csr_array:
-        """Return the rows (d·k, n) of T at k torn nodes.
+        """T (N, n), which maps displacements to torn unknowns in subdomain axes.
 
         Each torn node has a block Qᵀ, the transpose of the rotation of its subdomain.
         """
-        d, place = self.problem.components, self.nodes.number[nodes]
+        d, place = self.problem.components, self.nodes.number
         M, n = place.size, d * self.problem.layout.nodes
         if d == 1:
             return csr_array((np.ones(M), place, np.arange(M + 1)), shape=(M, n))
-        turn = self.rotation[self.nodes.subdomain[nodes]].transpose(0, 2, 1)
+        turn = self.rotation[self.nodes.subdomain].transpose(0, 2, 1)
         blocks = np.ascontiguousarray(turn), place, np.arange(M + 1)
         T = csr_array(bsr_array(blocks, shape=(d * M, n)))
         T.eliminate_zeros()
@@ -187,21 +192,51 @@ class TornBodies:
         first, class_of, rotation = classify(keys, points)
         of_class = [points[s] for s in first]
 
-        def template(k: int) -> SubdomainClass:
+        def mesh(k: int) -> SubdomainMesh:
             cells = of.cells_of(first[k])
             of_cells = np.full(len(cells), material[first[k]])
-            return problem.assemble_class(SubdomainMesh(of_class[k], cells, of_cells))
+            return SubdomainMesh(of_class[k], cells, of_cells)
 
         sizes = problem.components * np.array([len(at) for at in of_class])
-        rank = subdomain_ranks(problem, self.comm.size)
-        domains = Subdomains(
-            template=cache(template),
-            sizes=sizes,
-            class_of=class_of,
-            rank=rank,
-            comm=self.comm,
-        )
-        return domains, rotation
+        assembly = Assembly(mesh, problem.assemble_class)
+        return Subdomains(template=assembly, sizes=sizes, class_of=class_of), rotation
+
+    @cached_property
+    def rank(self) -> NDArray[np.int64]:
+        """Rank of each subdomain, (S,), ascending."""
+        return subdomain_ranks(self.problem, self.team.comm.size)
+
+    @cached_property
+    def ends(self) -> list[int]:
+        """First torn unknown of each rank, then the total number N."""
+        first = np.searchsorted(self.rank, np.arange(self.team.comm.size + 1))
+        ends: list[int] = self.domains.start[first].tolist()
+        return ends
+
+    @cached_property
+    def parts(self) -> Placed:
+        """The subdomains of each rank, as a `Subdomains` on that rank."""
+        own, team = [self.domains], self.team
+        if team.comm.size > 1:
+            ranks = range(team.comm.size)
+            own = [self._part(np.flatnonzero(self.rank == rank)) for rank in ranks]
+        return team.place(itself, own)
+
+    def _part(self, members: NDArray[np.int64]) -> Subdomains:
+        """Return some of the subdomains, which can be sent to another rank."""
+        class_of, assembly = self.domains.class_of[members], self.domains.template
+        assert isinstance(assembly, Assembly)
+        template = assembly.selected(np.unique(class_of).tolist())
+        return replace(self.domains, template=template, class_of=class_of)
+
+    def apply(self, method: str, v: NDArray[Any]) -> NDArray[Any]:
+        """Apply a method of `Subdomains` to a torn vector (N,)."""
+        return self.parts.apply(method, v, self.ends)
+
+    def kernel(self) -> csr_array:
+        """Return R = diag(R_1 … R_S) (N, r), the rigid motions of all subdomains."""
+        R_of = {k: R for own in self.parts("modes") for k, R in own.items()}
+        return block_diagonal([R_of[k] for k in self.domains.class_of.tolist()])
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -264,8 +299,28 @@ class TornBodies:
         assembly is expensive.
         """
         copy = replace(self, problem=problem)
-        vars(copy).update({"_classified": self._classified})
+        kept = ("_classified", "rank", "parts", "ends")
+        vars(copy).update({name: getattr(self, name) for name in kept})
         return copy
+
+
+def itself(part: T) -> T:
+    """Return the argument."""
+    return part
+
+
+def block_diagonal(blocks: list[Dense]) -> csr_array:
+    """Return the block diagonal matrix of dense blocks, without zeros."""
+    modes, size = (np.array([R.shape[axis] for R in blocks]) for axis in (1, 0))
+    # numbers of entries and first columns of all rows
+    width, first = (np.repeat(v, size) for v in (modes, np.cumsum(modes) - modes))
+    ends = np.append(0, np.cumsum(width)).astype(np.int32)
+    column = np.arange(ends[-1], dtype=np.int32)
+    column += np.repeat((first - ends[:-1]).astype(np.int32), width)
+    data = np.concatenate([R.ravel() for R in blocks])
+    matrix = csr_array((data, column, ends), shape=(size.sum(), modes.sum()))
+    matrix.eliminate_zeros()
+    return matrix
 
 
 class Rows(NamedTuple):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import pickle
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -21,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from mortarbench.harness.distributed.comm import Comm, _MPIComm
+from mortarbench.harness.distributed.comm import Comm, Team, _MPIComm
 from mortarbench.problems.feti.operators import DualOperator
 
 PATIENCE = 20.0  #: s; a busy machine may stop a thread for seconds
@@ -49,25 +50,22 @@ class ThreadComm:
         return ThreadComm(self.rank, new)
 
     def Send(self, part: np.ndarray, dest: int, tag: int) -> None:
-        assert dest == 0
-        self._shared.parts[self.rank].put(part.copy())
+        self._shared.parts[self.rank, dest].put(part.copy())
 
     def Recv(self, part: np.ndarray, source: int, tag: int) -> None:
-        while self._shared.parts[source].empty():
+        parts = self._shared.parts[source, self.rank]
+        while parts.empty():
             if self._shared.barrier.broken:
                 raise BrokenBarrierError
             time.sleep(1e-4)
-        part[...] = self._shared.parts[source].get()
+        part[...] = parts.get()
 
     def gather(self, value: Any) -> list[Any] | None:
         found = self._exchange(value)
         return None if self.rank else found
 
-    def bcast(self, value: Any, root: int = 0) -> Any:
-        return self._exchange(value if self.rank == root else None)[root]
-
     def Bcast(self, array: np.ndarray) -> None:
-        array[...] = self.bcast(array)
+        array[...] = self._exchange(None if self.rank else array)[0]
 
     def send(self, value: Any, dest: int, tag: int) -> None:
         self._shared.inboxes[dest].put(pickle.dumps(value))
@@ -108,7 +106,7 @@ def _shared(size: int, every: list[SimpleNamespace]) -> SimpleNamespace:
     shared = SimpleNamespace(
         barrier=Barrier(size), slots=[b""] * size, gathered={}, copies={}, every=every,
         inboxes=[SimpleQueue() for _ in range(size)],
-        parts=[SimpleQueue() for _ in range(size)],
+        parts=defaultdict(SimpleQueue),
     )  # fmt: skip
     every.append(shared)
     return shared
@@ -137,6 +135,23 @@ def results_of(size: int, work: Callable[[Comm], T]) -> list[T]:
     for e in sorted(failed, key=lambda e: isinstance(e, BrokenBarrierError)):
         raise e
     return found
+
+
+def on_rank_0(size: int, work: Callable[[Team], T]) -> T:
+    """Return the result of `work` on rank 0, while the other ranks serve."""
+
+    def one(comm: Comm) -> T | None:
+        team = Team(comm)
+        if comm.rank:
+            team.serve()
+            return None
+        result = work(team)
+        team.end()
+        return result
+
+    result = results_of(size, one)[0]
+    assert result is not None
+    return result
 
 
 def unlock(patch: pytest.MonkeyPatch) -> None:

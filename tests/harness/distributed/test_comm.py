@@ -5,57 +5,93 @@ import pytest
 
 from mortarbench.harness import InputError
 from mortarbench.harness.distributed import comm as module
-from mortarbench.harness.distributed.comm import SERIAL, Lead, RankFailedError, led
-from tests.support.threads_comm import on_ranks, results_of
+from mortarbench.harness.distributed.comm import RankFailedError, Team
+from tests.support.threads_comm import on_rank_0, on_ranks, results_of
 
 
 class Numbers:
-    """An array on each rank, with methods that all ranks call together."""
+    """An array on each rank."""
 
-    def __init__(self, comm, own):
-        self.comm, self.own, self.inner = comm, own, self
+    def __init__(self, own, other=None):
+        self.own, self.other = own, other
 
-    def total(self, factor, shift):
-        return self.comm.sum(factor * self.own + shift)
+    def scaled(self, factor, shift=0.0):
+        if np.isnan(factor):
+            raise ValueError("no factor")
+        return factor * self.own + shift
 
-    def rank(self):
-        return self.comm.rank
+    def shifted(self, part):
+        return part + self.own[0]
 
-    def failing_on(self, rank):
-        if self.comm.rank == rank:
+    def failing_on(self, value):
+        if self.own[0] == value:
             raise ValueError("no number")
-        return self.comm.sum(self.own)
+        return self.own
+
+    def others(self):
+        return self.other.own.tolist()
+
+
+def numbered(team):
+    """Place the array (r, r, r) on each rank r."""
+    return team.place(Numbers, [np.full(3, float(r)) for r in range(team.comm.size)])
+
+
+def length(part):
+    return len(part)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])
-def test_sums_and_lists_arrive_on_rank_0_and_broadcasts_everywhere(size):
+def test_parts_lists_and_sums_arrive(size):
     def work(comm):
-        part = np.full(4, comm.rank + 1.0)
-        whole = np.where(np.arange(size) == comm.rank, comm.rank + 1.0, 0.0)
-        comm.fill(whole, [slice(rank, rank + 1) for rank in range(size)])
-        assert comm.rank or whole.tolist() == list(range(1, size + 1))
-        return (
-            comm.sum(part),
-            comm.gather(comm.rank),
-            comm.bcast(comm.rank, size - 1),
-        )
+        own = comm.scatter(None if comm.rank else [10 * r for r in range(size)])
+        return comm.sum(np.full(4, comm.rank + 1.0)), comm.gather(comm.rank), own
 
     found = results_of(size, work)
 
     assert found[0][0].tolist() == [size * (size + 1) / 2] * 4
     assert [ranks for _, ranks, _ in found] == [list(range(size)), *[[]] * (size - 1)]
-    assert {last for _, _, last in found} == {size - 1}
+    assert [own for *_, own in found] == [10 * r for r in range(size)]
 
 
-def test_one_process_is_a_communicator_of_one_rank():
-    assert SERIAL.sum(np.ones(2)).tolist() == [1, 1]
-    assert SERIAL.gather(5) == [5]
-    assert SERIAL.bcast(5) == 5
-    assert SERIAL.together(lambda: 5) == 5
-    numbers = Numbers(SERIAL, np.arange(3.0))
-    assert (
-        led(SERIAL, numbers, lambda: Lead(SERIAL, numbers)("total", 2.0, 1.0)[2]) == 5
-    )
+def works_together(team):
+    """Use every operation of a team; return its results and those expected."""
+    size, numbers = team.comm.size, numbered(team)
+    x = np.arange(3.0)
+    ends = [2 * r for r in range(size + 1)]
+    v = np.arange(2.0 * size, dtype=np.longdouble)
+    pairs = team.place(Numbers, [x] * size, numbers)
+    return [
+        (numbers.total("scaled", 2.0, x).tolist(),
+         (size * x + size * (size - 1)).tolist()),
+        (numbers.apply("shifted", v, ends).tolist(),
+         (v + np.repeat(np.arange(size), 2)).tolist()),
+        ([part.tolist() for part in numbers("scaled", 1.0)],
+         [[float(r)] * 3 for r in range(size)]),
+        (pairs("others"), [[float(r)] * 3 for r in range(size)]),
+        (team.map(length, ["a" * r for r in range(size)]), list(range(size))),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_rank_0_uses_objects_with_parts_on_all_ranks(size):
+    for found, expected in on_rank_0(size, works_together):
+        assert found == expected
+
+
+def test_one_process_is_a_team_of_one_rank():
+    for found, expected in works_together(Team()):
+        assert found == expected
+
+
+def test_parts_are_freed_with_their_object():
+    def work(team):
+        numbers, other = numbered(team), numbered(team)
+        del numbers
+        other("scaled", 1.0)
+        return len(team._parts)
+
+    assert on_rank_0(2, work) == 2  # the service, and `other`
 
 
 def test_an_exception_on_one_rank_is_raised_on_all_ranks():
@@ -83,91 +119,34 @@ def test_ranks_that_succeed_return_their_own_results():
     assert results_of(3, lambda comm: comm.together(lambda: comm.rank)) == [0, 1, 2]
 
 
-@pytest.mark.parametrize("size", [2, 3])
-def test_the_result_of_rank_0_is_returned_on_all_ranks(size):
-    """The others serve: each adds its part to every sum that rank 0 orders."""
+def test_an_error_of_all_ranks_is_raised_as_it_is():
+    def work(team):
+        with pytest.raises(ValueError, match=r"^no factor$"):
+            numbered(team).total("scaled", np.nan)
+        return True
 
-    def work(comm):
-        numbers = Numbers(comm, np.arange(3.0) + comm.rank)
-        lead = Lead(comm, numbers)
-
-        def first():
-            once = lead("total", 2.0, np.ones(3))
-            return once, lead("inner.total", 1.0, 0.0), lead("rank")
-
-        # the service has ended; another one may follow
-        return led(comm, numbers, first), led(comm, numbers, lambda: lead("rank"))
-
-    own = [np.arange(3.0) + r for r in range(size)]
-    for (once, inner, first), again in results_of(size, work):
-        assert once.tolist() == (2 * sum(own) + size).tolist()
-        assert inner.tolist() == sum(own).tolist()
-        assert first == again == 0
+    assert on_rank_0(2, work)
 
 
-def test_an_error_of_rank_0_is_raised_on_all_ranks():
-    def work(comm):
-        numbers = Numbers(comm, np.zeros(1))
-
-        def fails():
-            Lead(comm, numbers)("total", 1.0, 0.0)
-            raise InputError("tol=-1; expected a positive number")
-
-        with pytest.raises(InputError, match="tol=-1; expected a positive number"):
-            led(comm, numbers, fails)
-        return led(comm, numbers, lambda: "next")
-
-    assert results_of(3, work) == ["next"] * 3
-
-
-def test_an_error_of_a_rank_that_serves_ends_all_ranks(monkeypatch, capfd):
-    """Rank 0 waits for the part of rank 1, which can never arrive."""
+def test_an_error_of_a_rank_for_which_others_wait_ends_all_ranks(monkeypatch, capfd):
+    """Rank 0 waits in another exchange, for which rank 1 never arrives."""
     monkeypatch.setattr(module, "PEER_TIMEOUT", 0.1)
 
     def work(comm):
-        numbers = Numbers(comm, np.zeros(1))
-        return led(comm, numbers, lambda: Lead(comm, numbers)("failing_on", 1))
+        return comm.together(lambda: 1 // 0) if comm.rank else comm.gather(0)
 
     found = on_ranks(2, work)
 
     assert all(isinstance(e, BaseException) for e in found)
-    assert "ValueError: no number" in capfd.readouterr().err
+    assert "ZeroDivisionError" in capfd.readouterr().err
 
 
-def test_an_error_of_a_rank_that_serves_is_raised_by_rank_0():
-    """Rank 1 has sent its part of the sum, which must not meet the next sum."""
+@pytest.mark.parametrize("rank", [0, 1, 2])
+def test_no_rank_waits_for_the_result_of_a_rank_that_fails(rank):
+    def work(team):
+        numbers = numbered(team)
+        with pytest.raises(RankFailedError, match=f"rank {rank} of 3: ValueError: no"):
+            numbers.total("failing_on", rank)
+        return numbers.total("scaled", 10.0).tolist()
 
-    class Late(Numbers):
-        def failing_on(self, rank):
-            if self.comm.rank == rank:
-                raise ValueError("no number")
-            return self.comm.sum(self.own) if self.comm.rank else None
-
-    def work(comm):
-        numbers = Late(comm, np.arange(2.0) + comm.rank)
-        lead = Lead(comm, numbers)
-
-        def call():
-            with pytest.raises(RankFailedError, match="rank 0 of 2: ValueError: no"):
-                lead("failing_on", 0)
-            return lead("total", 10.0, 0.0)
-
-        return led(comm, numbers, call)
-
-    assert [found.tolist() for found in results_of(2, work)] == [[10, 30]] * 2
-
-
-def test_the_objects_of_an_earlier_problem_are_refused():
-    lead = Lead(SERIAL, None)
-    with pytest.raises(RuntimeError, match="keep only the QP that they built last"):
-        lead("total", 1.0, 0.0)
-
-
-def test_an_error_of_all_ranks_in_a_service_is_that_of_rank_0():
-    def work(comm):
-        numbers = Numbers(comm, np.zeros(1))
-        with pytest.raises(AttributeError, match="no attribute 'product'"):
-            led(comm, numbers, lambda: Lead(comm, numbers)("product"))
-        return True
-
-    assert results_of(2, work) == [True, True]
+    assert on_rank_0(3, work) == [30.0] * 3

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.harness.distributed.comm import SERIAL
+from mortarbench.harness.distributed.comm import Team
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import certify
 from mortarbench.problems import PROBLEMS
@@ -110,7 +110,7 @@ def test_prescribed_displacements_on_ranks_are_refused(column):
     case = parse("bodies:a.toml/parts=4/dual", PROBLEMS)
     build = case.family.divided(case.form).build
     with pytest.raises(InputError, match="displacements on MPI ranks are not built"):
-        build(SERIAL, reference_of_operator)
+        build(Team(), reference_of_operator)
 
 
 @pytest.mark.parametrize("form", ["primal", "dual-bounds", "parts=4/dual"])

@@ -1,6 +1,5 @@
 """Torn bodies on ranks in threads: rank 0 obtains the results of one process."""
 
-from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -9,16 +8,18 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csr_array, issparse
 
-from mortarbench.harness.distributed.comm import SERIAL, led
+from mortarbench.harness import Solution
+from mortarbench.harness.distributed.comm import Team
 from mortarbench.harness.mechanics import Real
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.feti.served import Served, operator_of
+from mortarbench.problems.feti.subdomain_classes import Assembly
 from mortarbench.problems.feti.subdomains import Contact, TornBodies, subdomain_ranks
 from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.decomposed_bodies import parts_of as problem_of
-from tests.support.threads_comm import results_of, unlock
+from tests.support.threads_comm import on_rank_0, unlock
 
 pytestmark = pytest.mark.together
 
@@ -45,17 +46,16 @@ def ranks_do_not_lock_one_another_out():
         yield
 
 
-def built(name, comm):
-    """Build a case on ranks; return its objects on this rank, and the case."""
-    case = parse(f"{name}/dual", PROBLEMS)
-    return case.family.divided(case.form).build(comm, reference_of_operator)
-
-
-def facts(made, s):
-    """Return results of a case on rank 0, for given vectors and the answer `s`."""
-    lead, torn = made.served.lead, made.served.torn
-    case, parts = made.case(), made.served.local_problems
-    qp, F = case.qp, case.qp.P.build()
+def facts(name, team, s=None):
+    """Return results of a case for given vectors, and for the answer `s`."""
+    named = parse(f"{name}/dual", PROBLEMS)
+    case = named.family.divided(named.form).build(team, reference_of_operator)
+    if case.certifiable is not None:
+        mechanics = case.certifiable(Solution.without_point(case.qp, "solved", ""))[0]
+    else:
+        mechanics = case.mechanics.subdomains()
+    parts = mechanics.parts
+    torn, qp, F = parts.torn, case.qp, case.qp.P.build()
     rng = np.random.default_rng(5)
     X, v = rng.standard_normal((qp.q.size, 2)), rng.standard_normal(torn.f.size)
     w = rng.standard_normal(parts.spread.shape[0])
@@ -67,7 +67,7 @@ def facts(made, s):
             for p in PRECONDITIONERS
             for k, x in enumerate((X, X[:, 1]))
         },
-        "inverse": {"K⁺": lead("domains.inverse", v)},
+        "inverse": {"K⁺": torn.apply("inverse", v)},
         "parts": {
             "product": parts.product(w),
             "precise": parts.product(w.astype(Real)),
@@ -83,7 +83,7 @@ def facts(made, s):
     if s is None:
         s = reference_of_operator(qp)
     quantities = dict(case.quantities(s))
-    lead("forget")  # factors are computed again
+    F.forget()  # factors are computed again
     return found | {
         "s": s,
         "u": {"u": case.recover(s)},
@@ -94,19 +94,15 @@ def facts(made, s):
 
 @cache
 def alone(name):
-    return facts(built(name, SERIAL), None)
+    return facts(name, Team())
 
 
 @pytest.fixture(scope="module", params=CASES, ids=lambda p: p[0].partition("/")[0])
 def both(request):
     """Return results of several ranks, and those of one process."""
-    (name, size), s = request.param, alone(request.param[0])["s"]
-
-    def work(comm):
-        made = built(name, comm)
-        return led(comm, made.served, lambda: facts(made, s))
-
-    return results_of(size, work)[0], alone(name)
+    name, size = request.param
+    known = alone(name)
+    return on_rank_0(size, lambda team: facts(name, team, known["s"])), known
 
 
 def same(found, known, relative=1e-9, rounding=0.0):
@@ -165,57 +161,49 @@ def test_cases_without_subdomains_are_not_built_on_ranks(name):
     assert case.family.divided(case.form) is None
 
 
-def used(problem, size):
-    """Apply F on ranks.
-
-    Return the subdomains, and the number of classes that each rank assembled.
-    """
-
-    def work(comm):
-        assembled = []
-
-        def assemble(part):
-            assembled.append(part)
-            return problem.assemble_class(part)
-
-        served = Served(TornBodies(replace(problem, assemble_class=assemble), comm))
-        F = operator_of(served)
-        led(comm, served, lambda: F @ np.ones(F.shape[0]))
-        return served.domains, len(assembled)
-
-    found = results_of(size, work)
-    return found[0][0], [n for _, n in found]
-
-
 @pytest.mark.parametrize("size", [2, 3])
 @pytest.mark.parametrize(
     "name", ["membranes/S=2/n=3", "beam-ring/Nr=2/Nh=2/steps=1/feti=2"]
 )
-def test_ranks_assemble_only_classes_of_their_subdomains(name, size):
-    domains, assembled = used(problem_of(f"{name}/dual"), size)
-    own = [set(domains.class_of[domains.rank == r].tolist()) for r in range(size)]
+def test_ranks_assemble_only_classes_of_their_subdomains(name, size, monkeypatch):
+    problem, assembled = problem_of(f"{name}/dual"), []
+    assemble = Assembly.__call__
 
-    assert assembled == list(map(len, own))
+    def counted(self, k):
+        assembled.append((id(self), k))
+        return assemble(self, k)
+
+    monkeypatch.setattr(Assembly, "__call__", counted)
+
+    def work(team):
+        served = Served(TornBodies(problem, team))
+        F = operator_of(served)
+        F @ np.ones(F.shape[0])
+        torn = served.torn
+        return [set(torn.domains.class_of[torn.rank == r]) for r in range(size)]
+
+    own = on_rank_0(size, work)
+
+    by_rank = {rank: set() for rank, _ in assembled}
+    for rank, k in assembled:
+        by_rank[rank].add(k)
+    assert sorted(by_rank.values(), key=sorted) == sorted(own, key=sorted)
 
 
 def test_implicit_blocks_on_ranks_are_those_of_one_process(monkeypatch):
     monkeypatch.setattr("mortarbench.problems.feti.operators.MAX_EXPLICIT_MIB", 0)
     problem = problem_of("beam-ring/Nr=2/Nh=2/steps=1/feti=2/dual")
 
-    def work(comm):
-        served = Served(TornBodies(problem, comm))
+    def work(team):
+        served = Served(TornBodies(problem, team))
         P, m = operator_of(served), served.torn.rows.c.size
         x = np.random.default_rng(6).standard_normal(m)
+        F = P.build()
+        M = F.preconditioner("dirichlet", "stiffness")
+        assert not served.explicit.any()
+        return {"Fx": P @ x, "diagonal": F.diagonal(), "Mx": M(x)}
 
-        def facts():
-            F = P.build()
-            M = F.preconditioner("dirichlet", "stiffness")
-            return {"Fx": P @ x, "diagonal": F.diagonal(), "Mx": M(x)}
-
-        assert not served.operator.explicit.any()
-        return led(comm, served, facts)
-
-    same(results_of(2, work)[0], work(SERIAL))
+    same(on_rank_0(2, work), work(Team()))
 
 
 @pytest.mark.slow
@@ -225,11 +213,10 @@ def test_no_choice_of_keys_is_another_case_on_ranks(seed):
     for name in (*generated(rng), *generated(rng)):
         known = alone(name)
 
-        def work(comm, name=name, s=known["s"]):
-            made = built(name, comm)
-            return led(comm, made.served, lambda: facts(made, s))
+        def work(team, name=name, s=known["s"]):
+            return facts(name, team, s)
 
-        found = results_of(2 + seed % 2, work)[0]
+        found = on_rank_0(2 + seed % 2, work)
         assert found["digest"] == known["digest"], name
         for what in ("operator", "preconditioner", "parts", "dual", "u", "again"):
             same(found[what], known[what], 1e-7)

@@ -12,7 +12,7 @@ from tests.support.decomposed_bodies import decomposed_pair
 @pytest.fixture(scope="module")
 def parts() -> LocalProblems:
     """Return the local problems of beam and ring of the benchmark in subdomains."""
-    return decomposed_pair(most=8)[2].parts
+    return decomposed_pair(most=8)[2].local_problems
 
 
 def dense(parts: LocalProblems) -> np.ndarray:

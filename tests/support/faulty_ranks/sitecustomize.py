@@ -15,18 +15,19 @@ import os
 import signal
 import sys
 import time
+from functools import wraps
 from importlib.machinery import PathFinder
 
 #: stage → module, and function or method that fails
 STAGES = {
-    "build": ("mortarbench.problems.duality.decomposed", "case_on_ranks"),
+    "build": ("mortarbench.problems.feti.elastic", "elastic_class"),
     "prepare": ("mortarbench.problems.feti.operators", "DualOperator.prepare"),
     "product": ("mortarbench.problems.feti.operators", "DualOperator.__call__"),
     "certificate": (
-        "mortarbench.problems.feti.substructures",
-        "LocalProblems.squared_product",
+        "mortarbench.problems.feti.subdomain_classes",
+        "Subdomains.squared_product",
     ),
-    "quantities": ("mortarbench.problems.feti.served", "Served.largest_stresses"),
+    "quantities": ("mortarbench.problems.feti.elastic", "largest_in_patches"),
 }
 KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
 
@@ -44,6 +45,7 @@ def fail():
 
 
 def failing(work):
+    @wraps(work)  # pickled as a function of its module
     def fails(*args, **kwargs):
         found = work(*args, **kwargs) if KIND == "raises-after" else None
         fail()
