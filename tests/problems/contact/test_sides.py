@@ -41,10 +41,12 @@ def test_each_pair_of_a_disc_between_plates_carries_the_load(
         8, form="dual", contact=contact, basis=basis, disc_is_slave=disc_is_slave
     )
     s = reference_solution(case.qp)
-    contacts, sides = case.quantities(s)["contacts"], case.fields(s).contacts
+    values, sides = case.quantities(s), case.fields(s).contacts
+    contacts = values["contacts"]
     on = ("disc on {}", "{} on disc")[not disc_is_slave]
     total = 3 * PRESS
 
+    assert "contact_force" not in values  # there are two pairs
     assert list(contacts) == [on.format("lower"), on.format("upper")]
     for (name, pair), plate, sign in zip(
         contacts.items(), ("lower", "upper"), (-1, 1), strict=True

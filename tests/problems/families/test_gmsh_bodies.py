@@ -2,10 +2,8 @@
 
 import re
 import shutil
-import struct
 from pathlib import Path
 
-import meshio
 import numpy as np
 import pytest
 
@@ -19,8 +17,8 @@ from mortarbench.problems.fem.mesh import Mesh, nodal_lengths
 from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support import ROOT, press
-from tests.support.gmsh_files import msh22, square, stacked_mesh
+from tests.support import ROOT
+from tests.support.gmsh_files import entities41, msh22, square, stacked_mesh
 from tests.support.triangles import halved
 
 NR, NH = 2, 1
@@ -85,32 +83,12 @@ def parts(flip=False):
 
 def msh41(points, quads, curves, spots):
     """Return the text of a mesh in ASCII format 4.1, with one entity per physical group
-    or unnamed set of cells."""
-    groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
-    for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
-        counts.append(len(named))
-        for name, cells in named.items():
-            tag += 1
-            groups += [f'{dimension} {tag} "{name}"'] if name else []
-            box = "0 0 0" if dimension == 0 else "0 0 0 1 1 1"
-            of = f"1 {tag}" if name else "0"  # unnamed: by Mesh.SaveAll = 1
-            entities.append(f"{tag} {box} {of}" + (" 0" if dimension else ""))
-            blocks.append(f"{dimension} {tag} {kind} {len(cells)}")
-            for cell in cells:
-                cell_number += 1
-                nodes = " ".join(str(n + 1) for n in cell)
-                blocks.append(f"{cell_number} {nodes}")
-    n = len(points)
-    nodes = [str(i) for i in range(1, n + 1)]
-    nodes += [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
-    return "\n".join([
-        "$MeshFormat", "4.1 0 8", "$EndMeshFormat",
-        "$PhysicalNames", str(len(groups)), *groups, "$EndPhysicalNames",
-        "$Entities", " ".join(map(str, [*counts, 0])), *entities, "$EndEntities",
-        "$Nodes", f"1 {n} 1 {n}", f"2 {tag} 0 {n}", *nodes, "$EndNodes",
-        "$Elements", f"{tag} {cell_number} 1 {cell_number}", *blocks, "$EndElements",
-        "",
-    ])  # fmt: skip
+    or unnamed set of cells, as by Mesh.SaveAll = 1."""
+    kinds = (0, 15, spots), (1, 1, curves), (2, 3, quads)
+    return entities41(points, [
+        (dimension, kind, cells, [name] if name else [])
+        for dimension, kind, named in kinds for name, cells in named.items()
+    ]).decode()  # fmt: skip
 
 
 POINTS = np.column_stack([RING.mesh.points, np.zeros(len(RING.mesh.points))])
@@ -164,25 +142,19 @@ def test_triangles_of_any_orientation_are_read(tmp_path, clockwise):
         for name, cells in quads.items()
     }
     elements = {name: t[:, ::-1] if clockwise else t for name, t in triangles.items()}
-    (tmp_path / "m.msh").write_text(msh22(POINTS, elements, curves, spots, quad_type=2))
-    read = read_msh(tmp_path / "m.msh")
+    mesh = read(tmp_path, POINTS, elements, curves, spots, quad_type=2)
 
     for name, expected in triangles.items():
-        got = read.cells[read.surfaces[name]]
+        got = mesh.cells[mesh.surfaces[name]]
         np.testing.assert_array_equal(np.sort(got[:, :3]), np.sort(expected))
         np.testing.assert_array_equal(got[:, 3], got[:, 2])
         (ax, ay), (bx, by) = (
-            (read.points[got[:, k]] - read.points[got[:, 0]]).T for k in (1, 2)
+            (mesh.points[got[:, k]] - mesh.points[got[:, 0]]).T for k in (1, 2)
         )
         assert (ax * by > ay * bx).all()
-    whole = read_mesh_of_quads(tmp_path, quads, curves, spots)
+    whole = read(tmp_path, POINTS, quads, curves, spots)
     for name, edge in whole.curves.items():
-        np.testing.assert_array_equal(read.curves[name], edge)
-
-
-def read_mesh_of_quads(tmp_path, *contents):
-    (tmp_path / "quads.msh").write_text(msh22(POINTS, *contents))
-    return read_msh(tmp_path / "quads.msh")
+        np.testing.assert_array_equal(mesh.curves[name], edge)
 
 
 @pytest.mark.parametrize(
@@ -657,7 +629,8 @@ def bent(points):
          "two cells share the edge around (1.5, 1); expected cells that do not"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),
         (lambda p, c: (p, {"a": c}, {"m": [[1, 4]]}, {}), "curve 'm' has an edge that"),
-        (lambda p, c: (p + [[0, 0, 1]] * (p[:, :1] > 1), {"a": c}, {}, {}), "same z"),
+        (lambda p, c: (p + [[0, 0, 1]] * (p[:, :1] > 1), {"a": c}, {}, {}), "the nodes "
+         "are not all at the same z, and there"),
         (lambda p, c: (bent(p), {"a": c}, {}, {}), "the cell around ("),
     ],
 )  # fmt: skip
@@ -717,33 +690,6 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
         'Physical Surface("NAME") in the .geo file; or, if they belong to no body, '
         "save only physical groups: Mesh.SaveAll = 0"
     )
-
-
-def test_a_binary_file_of_all_entities_is_read(tmp_path):
-    """The first curve of the binary file has no physical tag."""
-    text = msh41(POINTS, *parts())
-    (tmp_path / "a.msh").write_text(text)
-    mesh = meshio.gmsh.read(tmp_path / "a.msh")
-    meshio.gmsh.write(tmp_path / "m.msh", mesh, "4.1", binary=True)
-    data = (tmp_path / "m.msh").read_bytes()
-    counts, point, *others = text.split("$Entities\n")[1].split("\n$End")[0].split("\n")
-    packed = struct.pack("4Q", *map(int, counts.split()))
-    packed += struct.pack("<i3dQi", *map(int, point.split()))
-    for k, line in enumerate(others):
-        tag, *box, _, physical, _ = map(int, line.split())
-        packed += struct.pack("<i6d", tag, *box)
-        packed += struct.pack("<Qi", 1, physical) if k else struct.pack("<Q", 0)
-        packed += struct.pack("<Q", 0)
-    head, _, rest = re.split(rb"\$(?:End)?Entities\n", data)
-    binary = head + b"$Entities\n" + packed + b"\n$EndEntities\n" + rest
-    (tmp_path / "m.msh").write_bytes(binary)
-    read, expected = (read_msh(tmp_path / f"{name}.msh") for name in "ma")
-
-    np.testing.assert_array_equal(read.cells, expected.cells)
-    np.testing.assert_array_equal(read.points, expected.points)
-    assert set(expected.curves) - set(read.curves) == {"left"}
-    for name, edge in read.curves.items():
-        np.testing.assert_array_equal(edge, expected.curves[name])
 
 
 def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
@@ -883,26 +829,6 @@ def test_friction_can_be_omitted_for_one_pair(described):
     qp = build(f"{name}/friction=coulomb/mu=1/dual-bounds").qp
 
     assert np.isinf(qp.ub).all()
-
-
-def test_a_surface_that_is_not_plane_is_refused(described):
-    bent = POINTS + np.outer(POINTS[:, 0] ** 2, [0, 0, 1])
-    described(msh22(bent, *parts()))
-    with pytest.raises(
-        InputError, match="the nodes are not all at the same z, and there"
-    ):
-        read_bodies(Path("a.toml"), "strain")
-
-
-def test_contact_forces_of_several_pairs_are_reported_pair_by_pair(tmp_path):
-    """A force of 2 MN/m is transferred through a disc and both of its contacts."""
-    case = build(f"bodies:{press.described(tmp_path)}/dual")
-    values = case.quantities(reference_solution(case.qp))
-
-    assert "contact_force" not in values
-    assert [pair["force"]["disc"][1] for pair in values["contacts"].values()] == (
-        pytest.approx([2e6, -2e6], rel=1e-6)
-    )
 
 
 def test_the_contact_force_of_one_pair_is_its_force_on_the_master(described):
