@@ -47,10 +47,11 @@ def test_a_penetrated_node_has_a_negative_gap():
     assert c == pytest.approx([-0.1])
 
 
-def test_at_a_vertex_the_normal_is_averaged_and_the_vertex_carries_the_force():
-    B, c, *_ = rows(np.array([[1.0, 1.5]]), ROOF)
+@pytest.mark.parametrize("gap", [0.5, 0.0])
+def test_at_a_vertex_the_normal_is_averaged_and_the_vertex_carries_the_force(gap):
+    B, c, *_ = rows(np.array([[1.0, 1.0 + gap]]), ROOF)
 
-    assert c == pytest.approx([0.5])
+    assert c == pytest.approx([gap], abs=1e-15)
     assert B.toarray() == pytest.approx(
         np.array([[0, -1, 0, 0, 0, 1, 0, 0]]), abs=1e-15
     )
@@ -82,30 +83,6 @@ def test_the_constraint_is_on_the_total_displacement():
 
     assert B_moved.toarray() == pytest.approx(B.toarray())
     assert c_moved == pytest.approx(c)
-
-
-@pytest.mark.parametrize("seed", [271828, 314159, 161803])
-def test_rows_are_invariant_under_translations_and_forces_balance(seed):
-    """The forces Bᵀλ of each row sum to zero.
-
-    Where the closest point is inside a segment, their moment about any point of the
-    current configuration also vanishes.
-    """
-    rng = np.random.default_rng(seed)
-    master = np.column_stack([np.linspace(4, 0, 9), 0.1 * rng.standard_normal(9)])
-    slave = np.column_stack([rng.uniform(0.3, 3.7, 12), rng.uniform(0.3, 0.6, 12)])
-    u = 0.05 * rng.standard_normal(42)
-    B, *_ = rows(slave, master, u)
-    x = np.concatenate([slave, master]) + u.reshape(-1, 2)
-    at = closest_points(x[:12], x[12:])
-    inside = (at.N[:, 0] > 0) & (at.N[:, 1] > 0)
-
-    forces = B.toarray().reshape(12, -1, 2)
-    moment = np.einsum("rn,n->r", forces[..., 1], x[:, 0])
-    moment -= np.einsum("rn,n->r", forces[..., 0], x[:, 1])
-    assert forces.sum(axis=1) == pytest.approx(0, abs=1e-14)
-    assert inside.sum() >= 4
-    assert moment[inside] == pytest.approx(0, abs=1e-13)
 
 
 def test_the_linearised_gap_is_exact_to_first_order():
@@ -153,15 +130,6 @@ def test_the_geometric_stiffness_is_the_derivative_of_the_forces(fixed):
 
     assert K == pytest.approx(K.T, abs=1e-12)
     assert K == pytest.approx(np.array([*moved]), abs=1e-6 * np.abs(K).max())
-
-
-def test_a_node_exactly_on_a_vertex_has_no_gap_and_the_averaged_normal():
-    B, c, *_ = rows(ROOF[1:2], ROOF)
-
-    assert c == pytest.approx([0], abs=1e-15)
-    assert B.toarray() == pytest.approx(
-        np.array([[0, -1, 0, 0, 0, 1, 0, 0]]), abs=1e-15
-    )
 
 
 def test_a_node_on_an_end_of_the_master_has_the_normal_of_the_last_segment():

@@ -8,10 +8,7 @@ import pytest
 from mortarbench.harness.suite.suite import load_suite
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
-from mortarbench.problems.contact.node_to_facet import node_to_facet
-from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
+from mortarbench.problems.duality.monolithic import monolithic_path
 from mortarbench.problems.families.beam_ring import BeamRing, model
 from mortarbench.registries import suites_folder
 from mortarbench.solvers import SOLVERS
@@ -119,26 +116,6 @@ def test_every_form_gives_the_same_displacement_energy_and_multipliers(plane):
     assert cases["primal"].qp.objective(u / 2.0) * 2e8 == pytest.approx(
         expected["energy"], rel=1e-9
     )
-
-
-@pytest.mark.parametrize("transform", ["dual", "dual-bounds"])
-def test_recovery_yields_a_primal_solution_with_all_multipliers(
-    transform,
-):
-    bodies = model(4, 3, 6, "strain")
-    slave, master, *_ = bodies.pairs[0]
-    rows = node_to_facet(bodies.mesh.points, np.zeros(848), slave, master)
-    primal = primal_qp(bodies, rows)
-    way = dualise if transform == "dual" else dual_bounds
-    inverse = (
-        factorise_floating(bodies) if transform == "dual" else factorise_clamped(bodies)
-    )
-    new = way(primal, inverse)
-
-    back = new.recover(SMALBE().prepare(new.qp, 1e-11)())
-
-    assert kkt_residuals(primal, back).worst < 1e-9
-    assert abs(back.y).max() > 0.1  # the clamps carry the load
 
 
 def test_load_steps_do_not_depend_on_the_order_of_requests():
@@ -341,10 +318,3 @@ def test_face_mortar_differs_from_the_plane_by_the_square_of_h(cells):
 
 def test_free_ends_soften_the_bodies():
     assert in_space(depth=2)["energy"] < in_space()["energy"] < 0
-
-
-def test_subdomains_of_extruded_bodies_have_the_same_solution():
-    keys = dict(depth=2, sides="plane-strain")
-    whole, parts = in_space(**keys), in_space(**keys, feti=4)
-    assert parts["energy"] == pytest.approx(whole["energy"], rel=1e-9)
-    assert parts["tip"] == pytest.approx(whole["tip"], abs=1e-9)

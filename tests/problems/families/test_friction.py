@@ -11,16 +11,9 @@ from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.balance import check_balance
-from mortarbench.problems.contact.bodies import ContactPair, assemble, factorise_clamped
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.rows import ContactRows, rows_along
-from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.contact.surface import tangents
-from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.families.patch import model
-from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import dofs_of, rectangle
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.incline import WEIGHT, block_on_incline, incline
 
@@ -205,7 +198,10 @@ def test_a_block_on_an_incline_slips_at_its_limit():
 
     assert values["stick"] > 0
     assert across / -onto == pytest.approx(0.3, abs=1e-3)
-    with pytest.raises(InputError, match="no equilibrium was found with bound"):
+    message = (
+        r"no equilibrium was found with bound.* friction cannot hold the load; exp"
+    )
+    with pytest.raises(InputError, match=message):
         block_on_incline(limit + 4e-4, COULOMB)
 
 
@@ -224,13 +220,6 @@ def test_a_bound_of_tresca_below_the_load_along_the_side_is_refused(share):
     )
     with pytest.raises(InputError, match=message):
         block_on_incline(0.2, law)
-
-
-def test_the_limit_of_coulombs_law_is_refused_with_the_same_message():
-    with pytest.raises(
-        InputError, match=r"no equilibrium .* friction cannot hold the load; expected"
-    ):
-        block_on_incline(0.412371 + 4e-4, COULOMB)
 
 
 def test_friction_may_balance_loads():
@@ -272,38 +261,3 @@ def test_quasi_static_slip_starts_from_the_previous_step():
     assert abs(friction.start).max() > 1e-3
     assert (static.mechanics.friction.start == 0).all()
     assert kkt_residuals(path.qp, s).worst < 1e-9
-
-
-@pytest.mark.parametrize(
-    "load", [(0.0, 1.0), pytest.param((1.0, 1.0), marks=pytest.mark.slow)]
-)
-def test_a_divergent_fixed_point_iteration_ends_with_its_last_residual(load):
-    """The tip of a slender beam touches a wall across the beam, where slip causes large
-    changes of the pressure."""
-    mesh = rectangle((0.0, 0.0), (4.0, 0.2), (20, 2))
-    sides = mesh.boundaries
-    tip = np.intersect1d(sides["top"], sides["right"])
-    force = np.zeros(mesh.dofs)
-    force[dofs_of(tip, 2)] = load
-    bodies = assemble(
-        mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=("beam",),
-        materials=(Material(1e6, 0.3),), plane="strain", units=(1.0, 1.0),
-        fixed=dofs_of(sides["left"], 2), load=force, pairs=(ContactPair(tip, tip),),
-    )  # fmt: skip
-    normal, one = np.array([[np.cos(0.1), np.sin(0.1)]]), np.ones((1, 1))
-    B = rows_along(tip[:, None], one, normal, mesh.dofs)
-    T = rows_along(tip[:, None], one, tangents(normal)[:, 0], mesh.dofs)
-    first = np.zeros(1, dtype=np.int64)
-    rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first, np.ones(1), first)
-    laws = (FrictionLaw("coulomb", mu=0.5),)
-    stages = load_steps(1, 1, bodies.f, bodies.fixed, laws)
-    path = load_path(
-        bodies, stages, lambda _: lambda u: rows, lambda _: factorise_clamped(bodies),
-        reference_solution,
-    )  # fmt: skip
-
-    message = (
-        r"converge in load step 1: after 3. Tresca problems, .* is [789]\.\de-01, and"
-    )
-    with pytest.raises(InputError, match=message):
-        path.problem(1)

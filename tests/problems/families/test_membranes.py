@@ -102,15 +102,6 @@ def test_contact_supports_the_right_membrane_on_part_of_the_edge():
     assert kkt_residuals(primal, case.mechanics.to_primal(s)).worst < 1e-9
 
 
-@pytest.mark.parametrize("glue", ["orthonormal", "redundant"])
-def test_smalbe_solves_the_dual_as_an_operator(glue):
-    case = built("dual", S=2, n=4, glue=glue)
-    s = SMALBE().prepare(case.qp, 1e-6)()
-
-    assert kkt_residuals(case.qp, s).worst <= 1e-5
-    assert case.quantities(s)["contact_force"] == pytest.approx(0.25, rel=1e-5)
-
-
 @pytest.mark.parametrize(("size", "best"), PERMON.items(), ids=str)
 def test_products_stay_below_those_of_the_best_settings_of_permon(size, best):
     S, n = size

@@ -127,14 +127,6 @@ def test_node_to_face_fails_as_in_the_plane():
     assert error(dim=3, lower=4, upper=4, contact="nts") <= 1e-10  # matching nodes
 
 
-def test_subdomains_of_blocks_in_space_have_the_same_solution():
-    keys = dict(dim=3, lower=4, upper=3, distort=0.2, ratio=10.0)
-    whole, parts = solved(**keys)[2], solved(feti=2, **keys)[2]
-    assert parts["stress_error"] <= 1e-10
-    for name in ("energy", "multiplier_sum", "contact_force"):
-        assert parts[name] == pytest.approx(whole[name], rel=1e-10, abs=1e-6)
-
-
 @pytest.mark.parametrize("form", ["dual", "primal"])
 def test_the_displacement_in_space_is_the_exact_linear_one(form):
     case, s, quantities = solved(form, dim=3, distort=0.2, ratio=1.0, lower=4, upper=3)

@@ -21,7 +21,7 @@ from scipy.sparse import (
 
 from mortarbench.cli.main import main
 from mortarbench.harness import QP, InputError
-from mortarbench.harness.files.qpfile import explicit_matrices, load_qp, save_qp
+from mortarbench.harness.files.qpfile import explicit_matrices
 from mortarbench.harness.names import assemble, parse
 from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.results.journal import read_journal
@@ -584,9 +584,6 @@ def test_other_files_are_refused(written, tmp_path):
         build(name)
     with pytest.raises(InputError, match=r"b\.mat: No such file"):
         build("file:b.mat")
-    written("", "a.csv")
-    with pytest.raises(InputError, match=r"a\.csv: unknown format '\.csv'; "):
-        build("file:a.csv")
     (tmp_path / "a.qps").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"a\.qps: not UTF-8"):
         build("file:a.qps")
@@ -707,38 +704,6 @@ def test_the_dual_s_matrices_satisfy_the_formulas_of_the_paper(written, command,
         assert R.shape[1] == 6
     else:
         assert R.shape == (f.size, 0)
-
-
-def test_unknown_export_formats_are_refused_with_the_available_ones(written, command):
-    code, _, err = command("export", f"{SMALL}/primal", "a.csv")
-
-    assert code == 2
-    assert err == (
-        "mortarbench: a.csv: unknown format '.csv'; expected .npz or .mat or .parquet "
-        "or .qps or .json or .bin or .cbf\n"
-    )
-
-
-def test_a_file_of_an_operator_comes_back_as_an_array(written, manufactured, tmp_path):
-    qp, _ = manufactured("everything", dense=True)
-    save_qp(tmp_path / "a.npz", qp, {"scale": -2.0, "constant": 3.0})
-    case = build("file:a.npz")
-
-    assert_same(case.qp, load_qp(tmp_path / "a.npz")[0])
-    assert (case.scale, case.constant) == (-2.0, 3.0)
-    assert isinstance(case.qp.P, np.ndarray)
-
-
-def test_a_file_can_be_solved_by_name(written, command):
-    code, out, _ = command(
-        "solve", written(QPS, "a.qps"), "--solver", "clarabel", "--json"
-    )
-    record = json.loads(out)
-
-    assert code == 0
-    assert record["case"] == "file:a.qps"
-    assert len(record["params"]["sha256"]) == 12
-    assert record["quantities"]["value"] == pytest.approx(record["objective"] + 4)
 
 
 @pytest.fixture
