@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import Mechanics, Solution, Status
 from mortarbench.harness.crossval.references import reference_point
-from mortarbench.harness.mechanics import Real
+from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.sets.convex import hull
 from mortarbench.harness.verify.active_set_refinement import (
     CLOSED,
@@ -32,7 +32,6 @@ from mortarbench.harness.verify.active_set_refinement import (
 )
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.supported_by_contact import _eliminated, _loose, _substituted
 
 BITS = 500  #: number of bits after the binary point
 FINE = 330  #: number of correct bits after refinement, relative to the largest unknown
@@ -248,6 +247,33 @@ def _solve(A: NDArray[np.float64], b: Integers) -> Integers:
         if max(abs(v) for v in whole) <= max(abs(v) for v in x) >> FINE:
             return x
     raise UnsettledError("refinement does not converge")
+
+
+def _loose(rows: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rigid motions (range of R) that lie in the kernel of the rows."""
+    _, sizes, turn = np.linalg.svd(rows @ R)
+    count = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
+    return np.asarray(R @ turn[count:].T)
+
+
+def _eliminated(A: Extended) -> tuple[Extended, NDArray[np.int64]]:
+    order = np.arange(len(A))
+    for k in range(len(A)):
+        pivot = k + int(np.abs(A[k:, k]).argmax())
+        A[[k, pivot]], order[[k, pivot]] = A[[pivot, k]], order[[pivot, k]]
+        A[k + 1 :, k] /= A[k, k]
+        A[k + 1 :, k + 1 :] -= np.outer(A[k + 1 :, k], A[k, k + 1 :])
+    return A, order
+
+
+def _substituted(factor: Extended, b: Extended) -> Extended:
+    x = b.copy()
+    for k in range(len(x)):
+        x[k + 1 :] -= factor[k + 1 :, k] * x[k]
+    for k in reversed(range(len(x))):
+        x[k] /= factor[k, k]
+        x[:k] -= factor[:k, k] * x[k]
+    return x
 
 
 def _inverse(M: list[list[Fraction]]) -> list[list[Fraction]]:

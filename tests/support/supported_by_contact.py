@@ -1,17 +1,13 @@
-"""Bodies supported only by contact, and their solutions in extended precision.
-
-The solutions satisfy the KKT equations of the stored data for given closed rows. They
-are computed by Gaussian elimination in extended precision and refined with residuals
-in rational arithmetic. Only the guess of the closed rows uses the code under test.
-"""
+"""A disc between plates, which only contact supports."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness import Case
-from mortarbench.harness.mechanics import Extended
+from mortarbench.harness import QP, Case
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -19,9 +15,9 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality.case_forms import contact_case
 from mortarbench.problems.duality.decomposed import subdivided
-from mortarbench.problems.duality.dualisation import Transformed
 from mortarbench.problems.duality.feti_dual import feti_dual
 from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.fem.elasticity import Material
@@ -32,20 +28,54 @@ from tests.support.decomposed_bodies import decompose_by_labels, parts_by
 PRESSURE = 1e7  #: pressure on the upper plate, Pa
 
 
-def disc_between_plates(
-    n: int = 4,
+def disc_between_plates(n: int = 4, *, form: str = "primal", **given: Any) -> Case:
+    """Press a disc of radius 1 m between a fixed plate and another, free or on rollers.
+
+    given : arguments of `posed`
+    """
+    bodies, primal, rows = posed(n, **given)
+    return contact_case(
+        bodies, primal, rows, form,
+        quantities=lambda s: quantities(bodies, primal, s, rows),
+    )  # fmt: skip
+
+
+def disc_in_parts(n: int = 4, *, parts: int = 6, **given: Any) -> DecomposedProblem:
+    """Return the dual of `disc_between_plates`, decomposed by METIS."""
+    bodies, primal, _ = posed(n, **given)
+    return parts_by(bodies, subdivided(bodies.shape, parts), primal)
+
+
+def dual_of_disc_between_plates(n: int = 4, *, parts: int = 6, **given: Any) -> QP:
+    """Return the QP of `disc_in_parts` for a mesh of the disc along the axes."""
+    bodies, primal, _ = posed(n, turn=0.0, **given)
+    layout = subdivided(bodies.shape, parts)
+    return feti_dual(decompose_by_labels(bodies, layout, primal), primal).qp
+
+
+def posed(
+    n: int, *, contact: str = "nts", basis: str = "dual", **shape: Any
+) -> tuple[Bodies, QP, ContactRows]:
+    """Return the bodies, their primal QP and its contact rows.
+
+    shape : arguments of `_disc_and_plates`
+    """
+    bodies = _disc_and_plates(n, **shape)
+    rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
+    return bodies, primal_qp(bodies, rows), rows
+
+
+def _disc_and_plates(
+    n: int,
     *,
-    form: str = "primal",
-    contact: str = "nts",
-    basis: str = "dual",
     disc_is_slave: bool = True,
     rollers: bool = False,
     turn: float = 0.3,
     tilt: float = 0.0,
     push: float = 0.0,
     E: tuple[float, float, float] = (70e9, 200e9, 70e9),
-) -> Case:
-    """Press a disc of radius 1 m between a fixed plate and another, free or on rollers.
+) -> Bodies:
+    """Assemble the bodies.
 
     n : number of cells across the disc
     rollers : True for rollers at the left side of the upper plate
@@ -53,56 +83,6 @@ def disc_between_plates(
     tilt : angle by which the whole assembly is rotated, rad
     push : horizontal traction, as a fraction of the pressure
     """
-    bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
-    rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
-    primal = primal_qp(bodies, rows)
-    return contact_case(
-        bodies, primal, rows, form,
-        quantities=lambda s: quantities(bodies, primal, s, rows),
-    )  # fmt: skip
-
-
-def disc_in_parts(
-    n: int = 4,
-    *,
-    parts: int = 6,
-    contact: str = "nts",
-    basis: str = "dual",
-    disc_is_slave: bool = True,
-    rollers: bool = False,
-    turn: float = 0.3,
-    tilt: float = 0.0,
-    push: float = 0.0,
-    E: tuple[float, float, float] = (70e9, 200e9, 70e9),
-) -> DecomposedProblem:
-    """Return the dual of `disc_between_plates`, decomposed by METIS."""
-    bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
-    rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
-    primal = primal_qp(bodies, rows)
-    return parts_by(bodies, subdivided(bodies.shape, parts), primal)
-
-
-def dual_of_disc_between_plates(
-    n: int = 4,
-    *,
-    parts: int = 6,
-    contact: str = "nts",
-    basis: str = "dual",
-    turn: float = 0.0,
-) -> Transformed:
-    """Build the dual of a disc between plates, decomposed by METIS, on one process."""
-    bodies = _disc_and_plates(n, True, False, turn, 0.0, 0.0, (70e9, 200e9, 70e9))
-    rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
-    primal = primal_qp(bodies, rows)
-    layout = subdivided(bodies.shape, parts)
-    return feti_dual(decompose_by_labels(bodies, layout, primal), primal)
-
-
-def _disc_and_plates(
-    n: int, disc_is_slave: bool, rollers: bool, turn: float, tilt: float, push: float,
-    E: tuple[float, float, float],
-) -> Bodies:  # fmt: skip
-    """Assemble the bodies of `disc_between_plates`."""
     lower = rectangle((-1.5, -1.0), (3.0, 1.0), (2 * n, n // 2))
     upper = rectangle((-1.5, 2.0), (3.0, 0.5), (2 * n + 1, n // 3))
     mesh, body = join((
@@ -163,30 +143,3 @@ def _rotation(angle: float) -> NDArray[np.float64]:
     return np.array([
         [np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]
     ])  # fmt: skip
-
-
-def _loose(rows: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rigid motions (range of R) that lie in the kernel of the rows."""
-    _, sizes, turn = np.linalg.svd(rows @ R)
-    count = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
-    return np.asarray(R @ turn[count:].T)
-
-
-def _eliminated(A: Extended) -> tuple[Extended, NDArray[np.int64]]:
-    order = np.arange(len(A))
-    for k in range(len(A)):
-        pivot = k + int(np.abs(A[k:, k]).argmax())
-        A[[k, pivot]], order[[k, pivot]] = A[[pivot, k]], order[[pivot, k]]
-        A[k + 1 :, k] /= A[k, k]
-        A[k + 1 :, k + 1 :] -= np.outer(A[k + 1 :, k], A[k, k + 1 :])
-    return A, order
-
-
-def _substituted(factor: Extended, b: Extended) -> Extended:
-    x = b.copy()
-    for k in range(len(x)):
-        x[k + 1 :] -= factor[k + 1 :, k] * x[k]
-    for k in reversed(range(len(x))):
-        x[k] /= factor[k, k]
-        x[:k] -= factor[:k, k] * x[k]
-    return x

@@ -172,7 +172,7 @@ def test_a_disc_whose_rotation_only_fixed_rows_prevent_is_solved(
 ):
     """With sparse rows, one eigenvalue of G_F G_Fᵀ is a rounding error."""
     monkeypatch.setattr(rows_module, "MAX_DENSE_ENTRIES", 0)
-    qp = dual_of_disc_between_plates(9, parts=parts, contact="mortar", basis=basis).qp
+    qp = dual_of_disc_between_plates(9, parts=parts, contact="mortar", basis=basis)
     assert isinstance(equality_rows(qp.A, qp.b, np.isfinite(qp.lb)), SparseRows)
     s = SMALBE().prepare(qp, 1e-8)()
     assert s.status is Status.SOLVED
