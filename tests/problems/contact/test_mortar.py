@@ -108,14 +108,6 @@ def test_integrals_of_a_half_covered_segment():
     assert I.gap == pytest.approx([0, 0])
 
 
-def test_the_dual_basis_of_a_full_segment_is_2_minus_1():
-    s, m = sides([[0, 0], [2, 0]], [[2, -1], [0, -1]])
-    at = cast_rays(s, m, overlaps(s, m), Reach())
-
-    N = np.stack([(1 - at.xi) / 2, (1 + at.xi) / 2], axis=-1)
-    assert module._dual(at) == pytest.approx(N @ [[2, -1], [-1, 2]])
-
-
 @pytest.mark.parametrize("basis", BASES)
 def test_a_linear_gap_is_exact_at_the_nodes_with_the_dual_basis(basis):
     """With the dual basis, ∫Φ_j g/∫N_j equals g_j; with the standard basis, it is an

@@ -1,7 +1,7 @@
 """Pressures and shear tractions between cylinders, compared with exact solutions."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -171,15 +171,7 @@ def test_errors_on_fine_meshes_are_those_of_finite_bodies(n):
     assert abs(got["half_width_error"]) <= 1e-3
 
 
-COULOMB = dict(n=20, m=20, friction="coulomb", mu=0.3)
-
-
-@cache
-def sheared_result(form="dual", **keys):
-    case = CYLINDER.with_keys(**{**COULOMB, **keys}).build(form, reference_solution)
-    s = SOLVERS[form].prepare(case.qp, TOL)()
-    assert kkt_residuals(case.qp, s).worst <= 10 * TOL
-    return case.quantities(s)
+sheared_result = partial(result, CYLINDER, n=20, m=20, friction="coulomb", mu=0.3)
 
 
 @pytest.mark.parametrize(

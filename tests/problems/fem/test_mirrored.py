@@ -104,14 +104,6 @@ def bodies(request):
     return model(4, 3, 4, request.param)
 
 
-def test_stiffness_and_load_are_mirrored(bodies):
-    there, S = mirrored(bodies, 0.7), diags_array(sign(bodies))
-    difference = abs(S @ bodies.K @ S - there.K).max()
-
-    assert difference <= 1e-13 * abs(bodies.K).max()
-    assert (there.f == S @ bodies.f).all()
-
-
 def kinked(bodies):
     """Return a displacement that bends the beam into a V whose tip is the closest point
     to several nodes."""

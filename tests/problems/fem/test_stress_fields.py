@@ -6,9 +6,6 @@ import pytest
 from mortarbench.harness import Solution, Status
 from mortarbench.problems.contact.bodies import (
     assemble,
-    factorise_clamped,
-    factorise_floating,
-    factorise_supported,
 )
 from mortarbench.problems.contact.node_to_facet import node_to_facet
 from mortarbench.problems.contact.results import fields, nodal_stresses
@@ -16,8 +13,7 @@ from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.families.beam_ring import model
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.inverse import NO_NODES
-from mortarbench.problems.fem.mesh import dofs_of
-from tests.support.hexahedra import bricks
+from mortarbench.problems.fem.mesh import box
 
 STEEL = Material(E=2e11, nu=0.3)
 STRAIN = np.array([2e-3, -1e-3, 3e-3])  # ε_x, ε_y, γ_xy
@@ -87,17 +83,14 @@ def test_fields_carry_the_stresses_of_the_dimensional_displacement():
         assert values == pytest.approx(expected[name], rel=1e-12)
 
 
-def cube(fixed=NO_NODES):
-    mesh = bricks((3, 3, 3), (1.0, 1.0, 1.0))
-    return assemble(
+def test_all_six_stresses_of_a_body_in_space_are_exact():
+    mesh, gradient = box((0, 0, 0), (1, 1, 1), (3, 3, 3)), np.arange(9) * 1e-3
+    gradient = gradient.reshape(3, 3)
+    bodies = assemble(
         mesh, np.zeros(27, dtype=np.int64), names=("cube",), materials=(STEEL,),
-        plane=None, units=(1.0, STEEL.E), fixed=fixed, load=np.zeros(mesh.dofs),
+        plane=None, units=(1.0, STEEL.E), fixed=NO_NODES, load=np.zeros(mesh.dofs),
         pairs=(),
     )  # fmt: skip
-
-
-def test_all_six_stresses_of_a_body_in_space_are_exact():
-    bodies, gradient = cube(), np.arange(9).reshape(3, 3) * 1e-3
     e = (gradient + gradient.T) / 2
     lame = STEEL.E * STEEL.nu / ((1 + STEEL.nu) * (1 - 2 * STEEL.nu))
     sigma = lame * np.trace(e) * np.eye(3) + STEEL.E / (1 + STEEL.nu) * e
@@ -112,21 +105,3 @@ def test_all_six_stresses_of_a_body_in_space_are_exact():
             assert nodal[name] == pytest.approx(value, rel=1e-9)
     norm = np.sqrt(1.5 * (deviator**2).sum())
     assert nodal["von_mises"] == pytest.approx(norm, rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    "inverse", [factorise_clamped, factorise_supported, factorise_floating]
-)
-def test_inverses_of_bodies_in_space_solve_for_a_force_at_one_corner(inverse):
-    """K⁺ is tested for a cube with a clamped side and for a floating cube."""
-    fixed = dofs_of(np.flatnonzero(cube().mesh.points[:, 2] == 0), 3)
-    bodies = cube(fixed)
-    b = np.zeros(bodies.mesh.dofs)
-    b[-3:] = 1.0, -2.0, 3.0
-    if inverse is factorise_floating:
-        b -= bodies.rigid @ (bodies.rigid.T @ b)
-        fixed = fixed[:0]
-
-    left = bodies.K @ inverse(bodies)(b) - b
-
-    assert abs(np.delete(left, fixed)).max() <= 1e-11

@@ -16,7 +16,6 @@ from mortarbench.problems.fem.elasticity import (
     stiffness,
 )
 from mortarbench.problems.fem.mesh import (
-    as_vectors,
     boundary_facets,
     dofs_of,
     half_ring,
@@ -122,13 +121,3 @@ def pressed(which, **keys):
 @pytest.mark.parametrize("basis", ["dual", "standard"])
 def test_mortar_passes_the_patch_test_on_triangles(which, slave, basis):
     assert pressed(which, slave=slave, basis=basis)[-1] <= 1e-8
-
-
-def test_node_to_segment_fails_on_triangles_but_transfers_the_total_force():
-    bodies, primal, s, error = pressed((True, True), contact="nts")
-    forces = as_vectors(-(primal.G.T @ s.z) * bodies.force, 2)
-
-    assert error > 0.05
-    assert forces[bodies.body_of_node == 0].sum(axis=0) == pytest.approx(
-        [0, -PRESSURE], abs=1
-    )
