@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.harness.names import parse
-from mortarbench.problems import PROBLEMS
-from mortarbench.solvers.reference.solve import reference_solution
+from tests.support import cases
 from tests.support.block_pairs import PRESSURE, block_pair
 from tests.support.press import DISC, described
 
@@ -19,9 +17,7 @@ EQUAL = (((0.0, 2.0),), ((0.0, 2.0),), ((4, 2), (6, 2)))
 
 def solved(path, keys="contact=nts"):
     """Return the case, its solution and its quantities."""
-    case = parse(f"bodies:{path}/{keys}/dual", PROBLEMS).build(reference_solution)
-    s = reference_solution(case.qp)
-    return case, s, case.quantities(s)
+    return cases.solved(f"bodies:{path}/{keys}/dual")
 
 
 def forces(case, s):

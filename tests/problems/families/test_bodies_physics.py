@@ -13,6 +13,7 @@ from mortarbench.harness.verify.certificate import certify
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.cases import built, solved
 from tests.support.gmsh_files import msh22, solids22, square, stacked_mesh
 from tests.support.solid_blocks import solid_blocks
 
@@ -86,13 +87,6 @@ rigid = {{ shape = "plane", point = {point}, normal = {normal} }}
 
 def edges(chain):
     return np.stack([chain[:-1], chain[1:]], axis=1)
-
-
-def solved(name):
-    """Return a case, its solution and its quantities."""
-    case = parse(name, PROBLEMS).build(reference_solution)
-    s = reference_solution(case.qp)
-    return case, s, case.quantities(s)
 
 
 def displacements(case, s):
@@ -426,7 +420,7 @@ def remarks(points, cells, sides, nu=0.3, kind=3):
         'loads = [{ boundary = "top", force = [0, -1] }]\n'
     )
     name = before_a_plane(mesh, "base", [0, 0], [0, 1], more, a=(1e9, nu))
-    return parse(name, PROBLEMS).build(reference_solution).remarks
+    return built(name).remarks
 
 
 def test_a_crack_and_triangles_that_lock_are_remarked():
@@ -458,7 +452,7 @@ def test_a_contact_side_around_a_sharp_edge_is_remarked(height, folds):
         'loads = [{ boundary = "end", force = [0, 0, -1] }]\n'
     )
     name = before_a_plane(mesh, "slave", [0, 0, 0], [0, 0, 1], more, a=(1e9, 0.3))
-    case = parse(name, PROBLEMS).build(reference_solution)
+    case = built(name)
     assert len(case.remarks) == folds
     assert not folds or "a contact side is folded at (0, 0.5, 0) m" in case.remarks[0]
 

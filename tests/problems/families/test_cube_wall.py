@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import certify
-from mortarbench.harness.names import parse
-from mortarbench.problems import PROBLEMS
 from mortarbench.reports.export.vtu import write_vtu
 from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.cases import built
 
 #: number of cells per edge → numbers of rows and active rows, force on the cube in N,
 #: energy in J, u_z(1, 1, 1) in m
@@ -23,7 +21,7 @@ DIGITS = {
 
 @cache
 def solved(keys, solver):
-    case = parse(f"cube-wall/{keys}", PROBLEMS).build(reference_solution)
+    case = built(f"cube-wall/{keys}")
     return case, SOLVERS[solver].prepare(case.qp, 1e-11)()
 
 

@@ -15,19 +15,13 @@ from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.families.patch import model
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support import cases
 from tests.support.incline import WEIGHT, block_on_incline, incline
 
 pytestmark = pytest.mark.together
 
+solved = cache(cases.solved)
 SMALL = "beam-ring/Nr=3/Nh=2/steps=1"
-
-
-@cache
-def solved(name):
-    """Return the case, its solution and its quantities."""
-    case = parse(name, PROBLEMS).build(reference_solution)
-    s = reference_solution(case.qp)
-    return case, s, case.quantities(s)
 
 
 # mu, tip_y in m, vertical force on the beam in 10⁸ N/m, sticking rows (8 are active)

@@ -6,22 +6,20 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError, certify
-from mortarbench.harness.names import parse
-from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.half_space.point_contact import PointContact
 from mortarbench.problems.families.hertz_sphere import (
     point_force_stress,
     tangential_force_stress,
 )
 from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.cases import built
 
 pytestmark = pytest.mark.together
 
 
 @cache
 def solved(keys, solver="smalbe", tol=1e-11):
-    case = parse(f"hertz-sphere/{keys}", PROBLEMS).build(reference_solution)
+    case = built(f"hertz-sphere/{keys}")
     s = SOLVERS[solver].prepare(case.qp, tol)()
     return case, s, case.quantities(s)
 
@@ -131,7 +129,7 @@ def test_formulae_have_the_digits_of_two_larger_spheres():
     assert exact.p0 == pytest.approx(2798.329, abs=5e-4)
     keys = f"against=sphere/R=50/E=2e4/nu=0.3/load={exact.P}/dual"
     with pytest.raises(InputError, match="the contact radius 10 is more than R/8 = 6"):
-        parse(f"hertz-sphere/{keys}", PROBLEMS).build(reference_solution)
+        built(f"hertz-sphere/{keys}")
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mortarbench.harness import Case
-from mortarbench.harness.names import parse
-from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.feti_models import (
     Plate,
     dual_quantities,
@@ -17,6 +14,7 @@ from mortarbench.problems.families.feti_models import (
 from mortarbench.problems.feti.subdomains import TornBodies
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.cases import built
 
 pytestmark = pytest.mark.together
 
@@ -37,10 +35,6 @@ PUBLISHED = [
 ]
 #: one plane and one three-dimensional problem
 QUICK = [PUBLISHED[0], PUBLISHED[4]]
-
-
-def built(name: str) -> Case:
-    return parse(f"{name}/dual", PROBLEMS).build(reference_solution)
 
 
 @cache
@@ -97,7 +91,7 @@ def test_condition_numbers_with_jumps_are_those_of_a_prototype(jump, name, value
     ],
 )  # fmt: skip
 def test_the_dual_has_the_displacement_of_the_plate(name):
-    case = built(name)
+    case = built(f"{name}/dual")
     s = SMALBE().prepare(case.qp, 1e-9)()
     primal = case.mechanics.primal
     u = case.mechanics.inverse(-primal.q)

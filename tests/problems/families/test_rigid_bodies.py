@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import ContactPair
 from mortarbench.problems.contact.linearise import linearisation
@@ -18,6 +17,7 @@ from mortarbench.problems.families.line_contact import LineContact
 from mortarbench.problems.fem.mesh import box, rectangle
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.cases import built
 from tests.support.gmsh_files import msh22, solids22
 
 E, NU, PRESSURE = 1e9, 0.3, 1e6
@@ -80,7 +80,7 @@ def block(folder, toml):
 
 
 def solve(text, form="dual"):
-    case = parse(f"bodies:{text}/{form}", PROBLEMS).build(reference_solution)
+    case = built(f"bodies:{text}/{form}")
     if "parts" in form:  # P is an operator
         s = SOLVERS["smalbe"].prepare(case.qp, 1e-11)()
     else:

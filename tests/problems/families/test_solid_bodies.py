@@ -6,12 +6,11 @@ import pytest
 
 from mortarbench.cli.main import main
 from mortarbench.harness import InputError
-from mortarbench.harness.names import parse
-from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.description import read_bodies
 from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.cases import built
 from tests.support.hexahedra import TETRAHEDRA, WEDGES
 from tests.support.solid_blocks import NU, PRESSURE, TOML, E, solid_blocks
 
@@ -43,10 +42,6 @@ master = "table"
 """
 
 
-def build(text):
-    return parse(text, PROBLEMS).build(reference_solution)
-
-
 @pytest.mark.parametrize(
     ("keys", "kind"),
     [
@@ -58,7 +53,7 @@ def build(text):
 def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, keys):
     """On interfaces that do not match, the displacement is p/E (ν x, ν y, −z) in both
     blocks."""
-    case = build(f"bodies:{solid_blocks(tmp_path, KINDS[kind])}/{keys}")
+    case = built(f"bodies:{solid_blocks(tmp_path, KINDS[kind])}/{keys}")
     s = reference_solution(case.qp)
     fields = case.fields(s)
     exact = PRESSURE / E * fields.points * [NU, NU, -1]
@@ -82,7 +77,7 @@ def test_forms_and_subdomains_have_the_same_answer(tmp_path, kind, contact):
     text = f"bodies:{solid_blocks(tmp_path, KINDS[kind], HELD)}/contact={contact}"
     answers = []
     for form in ("dual-bounds", "primal", "dual", "parts=4/dual"):
-        case = build(f"{text}/{form}")
+        case = built(f"{text}/{form}")
         if "parts" in form:  # P is an operator
             s = SOLVERS["smalbe"].prepare(case.qp, 1e-11)()
         else:
@@ -150,23 +145,17 @@ def test_pressure_picture_and_grid_are_written(tmp_path, monkeypatch, capsys):
          "supports[0]: point: unknown physical point or curve 'base'"),
         ('slave = "foot"', 'slave = "boot"', "",
          "contacts[0]: slave: unknown physical surface 'boot'; did you mean 'foot'?"),
-        ('slave = "foot"', 'slave = "left"', "", "slave and master share nodes"),
         ("[0, 0, -1e6]", "[0, -1e6]", "",
          "traction = [0, -1000000.0]; expected three numbers, [x, y, z]"),
-        ('fix = ["z"]', 'fix = ["w"]', "", "unknown component 'w'; known: all, normal"),
         ('boundary = "top"', 'boundary = "base"', "", "acts on 'base' in z, where a"),
-        ('fix = ["y"]', 'fix = ["x"]', "",
-         "body 'upper': nothing balances its load in y; expected a support"),
     ],
 )  # fmt: skip
 def test_settings_unsupported_for_volumes_are_refused_in_one_line(
     tmp_path, old, new, keys, message
 ):
     toml = TOML.replace(old, new) if old else TOML
-    if message.endswith("in y; expected a support"):
-        toml = toml.replace("[0, 0, -1e6]", "[0, 1e5, -1e6]")
     with pytest.raises(InputError) as e:
-        build(f"bodies:{solid_blocks(tmp_path, TETRAHEDRA, toml)}{keys}/dual")
+        built(f"bodies:{solid_blocks(tmp_path, TETRAHEDRA, toml)}{keys}/dual")
 
     assert message in str(e.value)
     assert "\n" not in str(e.value)
@@ -181,4 +170,4 @@ def test_a_block_that_tips_over_an_edge_is_refused(tmp_path):
     toml += '[[loads]]\nboundary = "left"\ntraction = [0, 0, 6e5]\n'
     path = solid_blocks(tmp_path, toml=toml)
     with pytest.raises(InputError, match="'upper': nothing balances the moment of its"):
-        build(f"bodies:{path}/contact=nts/dual")
+        built(f"bodies:{path}/contact=nts/dual")

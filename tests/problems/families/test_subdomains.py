@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError, Status
-from mortarbench.harness.names import parse
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.verdicts import certified
-from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact import bodies
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.cases import built
 from tests.support.press import described
 
 pytestmark = pytest.mark.together
@@ -37,10 +36,6 @@ CASES = [
     ("obstacle/n=8", "feti=3"),
     ("obstacle/dim=1/n=12", "feti=4"),
 ]
-
-
-def built(name):
-    return parse(name, PROBLEMS).build(reference_solution)
 
 
 @cache

@@ -5,12 +5,10 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
-from mortarbench.harness.names import parse
-from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.mesh import nodal_areas
 from mortarbench.problems.fem.mesh_files.named import named_mesh
 from mortarbench.problems.fem.mesh_files.reading import read_mesh_file, read_msh
-from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.cases import built, solved
 from tests.support.gmsh_files import entities41, solids22, text22
 from tests.support.hexahedra import TETRAHEDRA, WEDGES
 from tests.support.mesh_formats import INSTANCES, write_inp, write_med
@@ -47,8 +45,7 @@ def test_a_mesh_has_the_bodies_and_sides_of_the_msh_file(tmp_path, kind, name):
     energies = []
     for mesh in ("blocks.msh", name):
         path.write_text(TOML.replace("blocks.msh", mesh))
-        case = parse(f"bodies:{path}/dual", PROBLEMS).build(reference_solution)
-        energies.append(case.quantities(reference_solution(case.qp))["energy"])
+        energies.append(solved(f"bodies:{path}/dual")[2]["energy"])
     chosen = named_like(tmp_path / name, expected)
 
     assert energies[1] == pytest.approx(energies[0], rel=1e-12)
@@ -154,9 +151,9 @@ def test_sets_that_overlap_the_described_bodies_are_not_needed(tmp_path):
     path.write_text(TOML.replace("blocks.msh", "blocks.inp"))
     inp = (tmp_path / "blocks.inp").read_text()
     (tmp_path / "blocks.inp").write_text(inp + "*ELSET, ELSET=both\nlower, upper\n")
-    case = parse(f"bodies:{path}/dual", PROBLEMS).build(reference_solution)
+    case, s, _ = solved(f"bodies:{path}/dual")
 
-    assert case.fields(reference_solution(case.qp)).bodies.max() == 1
+    assert case.fields(s).bodies.max() == 1
     for old, new, message in (
         ('"lower"', '"lowr"', "unknown element set 'lowr'; did you mean 'lower'?"),
         ('"lower"', '"both"', "element set 'both' shares 8 cells with another body"),
@@ -166,12 +163,12 @@ def test_sets_that_overlap_the_described_bodies_are_not_needed(tmp_path):
     ):  # fmt: skip
         path.write_text(TOML.replace("blocks.msh", "blocks.inp").replace(old, new))
         with pytest.raises(InputError) as e:
-            parse(f"bodies:{path}/dual", PROBLEMS).build(reference_solution)
+            built(f"bodies:{path}/dual")
         assert message in str(e.value)
     body = TOML[TOML.index('[[bodies]]\nname = "upper"') : TOML.index("[[supports]]")]
     path.write_text(TOML.replace("blocks.msh", "blocks.inp").replace(body, ""))
     with pytest.raises(InputError, match=r"bodies: element set '.*' has no entry"):
-        parse(f"bodies:{path}/dual", PROBLEMS).build(reference_solution)
+        built(f"bodies:{path}/dual")
 
 
 @pytest.mark.parametrize(

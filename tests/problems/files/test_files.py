@@ -33,6 +33,7 @@ from mortarbench.problems.files.two_sided import loaded
 from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.cases import built
 
 #: example from the report of Maros and Mészáros with further rows, ranges and bounds;
 #: contains every type of row
@@ -71,11 +72,6 @@ QUADOBJ
     c2        c2                10.0
 ENDATA
 """
-
-
-def build(text):
-    name = parse(text, PROBLEMS)
-    return name.build(reference_solution)
 
 
 def solved(qp):
@@ -201,8 +197,8 @@ def test_an_exported_qps_comes_back_to_the_last_digit(tmp_path):
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
 def test_the_export_of_a_case_as_qps_is_its_qp(written, command, form):
     assert command("export", f"{SMALL}/{form}", "a.qps")[0] == 0
-    qp = build(f"{SMALL}/{form}").qp
-    back = build("file:a.qps").qp
+    qp = built(f"{SMALL}/{form}").qp
+    back = built("file:a.qps").qp
 
     assert_same(of_symmetric_part(qp), back)
 
@@ -248,7 +244,7 @@ def test_a_compressed_file_is_the_file(written, tmp_path, name):
         gzip.compress(plain[:99]) + gzip.compress(plain[99:])
     )
 
-    assert_same(build(f"file:{name}").qp, build(f"file:{name}.gz").qp)
+    assert_same(built(f"file:{name}").qp, built(f"file:{name}.gz").qp)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +257,7 @@ def test_a_compressed_file_is_the_file(written, tmp_path, name):
 )
 def test_unknown_formats_are_refused_compressed_or_not(written, name, message):
     with pytest.raises(InputError) as e:
-        build(written("", name))
+        built(written("", name))
     assert message in str(e.value)
 
 
@@ -326,7 +322,7 @@ def value_of(case):
 
 
 def test_the_published_optimum_of_qptest(written):
-    assert value_of(build(written(QPTEST, "a.qps"))) == pytest.approx(8.371875)
+    assert value_of(built(written(QPTEST, "a.qps"))) == pytest.approx(8.371875)
 
 
 @pytest.mark.parametrize(
@@ -342,7 +338,7 @@ def test_of_several_sets_the_first_is_used_with_a_remark(
 ):
     """Any other set would change the optimum."""
     text = QPTEST.replace(after, after + other, 1)
-    case = build(written(text, "a.qps"))
+    case = built(written(text, "a.qps"))
 
     assert value_of(case) == pytest.approx(8.371875)
     (remark,) = case.remarks
@@ -362,13 +358,13 @@ def test_of_several_sets_the_first_is_used_with_a_remark(
     ],
 )
 def test_comments_and_names_with_spaces_or_special_characters(written, text):
-    assert value_of(build(written(text, "a.qps"))) == pytest.approx(8.371875)
+    assert value_of(built(written(text, "a.qps"))) == pytest.approx(8.371875)
 
 
 def test_names_with_spaces_need_fixed_columns(written):
     text = qptest(c1="c 1").replace(" UP bnd1      c 1", " UP bnd1 c 1")
     with pytest.raises(InputError, match="line 15: column 'bnd1 c 1' is not among COL"):
-        build(written(text, "a.qps"))
+        built(written(text, "a.qps"))
 
 
 @pytest.mark.parametrize("line", ["OBJSENSE MAX", "OBJSENSE\n    maximize"])
@@ -378,14 +374,14 @@ def test_a_maximised_linear_objective(written, line):
         f"NAME\n{line}\nROWS\n N obj\n L sum\nCOLUMNS\n x1 obj 1 sum 1\n"
         " x2 obj 2 sum 1\nRHS\n rhs sum 2 obj -1\nENDATA\n"
     )
-    case = build(written(text, "a.mps"))
+    case = built(written(text, "a.mps"))
 
     assert value_of(case) == pytest.approx(5.0)  # with the constant 1
 
 
 def test_a_maximised_objective_is_minus_a_minimised_one(written):
     concave = QPS.replace("8.0", "-8.0").replace("10.0", "-10.0")
-    case = build(written(concave.replace("ROWS", "OBJSENSE\n    MAX\nROWS"), "a.QPS"))
+    case = built(written(concave.replace("ROWS", "OBJSENSE\n    MAX\nROWS"), "a.QPS"))
     s = solved(case.qp)
 
     # maximum of −4c₁² + 2c₁c₂ − 5c₂² + 1.5c₁ − 2c₂ + 4 with r1 and r2 at their lower
@@ -427,7 +423,7 @@ def test_a_bad_qps_text_is_refused_with_its_line(written, old, new, message):
     if message is None:
         text, message = text.replace(" N  ignored\n", " G  ignored\n"), "no row of type"
     with pytest.raises(InputError) as e:
-        build(written(text, "a.qps"))
+        built(written(text, "a.qps"))
 
     assert str(e.value).startswith(f"a.qps: {message}")
     assert "\n" not in str(e.value)
@@ -450,7 +446,7 @@ MAT = {
 
 
 def test_two_sided_rows_become_equalities_and_inequalities(written):
-    case = build(written(MAT, "a.mat"))
+    case = built(written(MAT, "a.mat"))
     qp, A = case.qp, MAT["A"].toarray()
 
     np.testing.assert_array_equal(csc_array(qp.P).toarray(), MAT["P"].toarray())
@@ -473,7 +469,7 @@ def test_identity_rows_at_the_end_are_the_bounds(written):
         "u": np.hstack([MAT["u"], bounds[1]]),
         "m": 9,
     }
-    qp = build(written(more, "a.mat")).qp
+    qp = built(written(more, "a.mat")).qp
 
     assert (qp.b.size, qp.h.size) == (1, 4)
     np.testing.assert_array_equal(qp.lb, [0, -np.inf, -1, 2])
@@ -490,7 +486,7 @@ def test_older_names_and_separate_bounds_are_accepted(written):
     }  # fmt: skip
 
     assert_same(
-        build(written(older, "b.mat")).qp, build(written(MAT | rows, "a.mat")).qp
+        built(written(older, "b.mat")).qp, built(written(MAT | rows, "a.mat")).qp
     )
 
 
@@ -498,7 +494,7 @@ def test_limits_near_1e20_are_infinite(written):
     """A limit of 1e20 may change in its seventh digit when a file is converted."""
     near = MAT | {"l": np.array([[1.0, -9.999_999_9e19, -2, -9.999_995e19, -1]])}
 
-    assert_same(build(written(near, "b.mat")).qp, build(written(MAT, "a.mat")).qp)
+    assert_same(built(written(near, "b.mat")).qp, built(written(MAT, "a.mat")).qp)
 
 
 @pytest.mark.parametrize(
@@ -526,7 +522,7 @@ def test_limits_near_1e20_are_infinite(written):
 def test_an_invalid_mat_file_is_named_with_the_error(written, changes, message):
     content = {k: v for k, v in (MAT | changes).items() if v is not None}
     with pytest.raises(InputError) as e:
-        build(written(content, "a.mat"))
+        built(written(content, "a.mat"))
 
     assert str(e.value).startswith(f"a.mat: {message}")
     assert "\n" not in str(e.value)
@@ -554,7 +550,7 @@ def test_a_qp_that_is_not_convex_is_refused(written, P, message):
     n = P.shape[0]
     free = {"A": eye_array(n), "l": -np.ones(n), "u": np.ones(n), "q": np.zeros(n)}
     with pytest.raises(InputError) as e:
-        build(written({"P": csc_matrix(P), **free}, "a.mat"))
+        built(written({"P": csc_matrix(P), **free}, "a.mat"))
 
     expected = f"a.mat: P is not positive semidefinite: {message}"
     assert str(e.value).startswith(expected)
@@ -575,18 +571,18 @@ def test_rounding_does_not_make_a_semidefinite_p_non_convex(written, P):
     n = len(P)
     free = {"A": eye_array(n), "l": -np.ones(n), "u": np.ones(n), "q": np.ones(n)}
 
-    assert build(written({"P": csc_matrix(np.array(P)), **free}, "a.mat")).qp.q.size
+    assert built(written({"P": csc_matrix(np.array(P)), **free}, "a.mat")).qp.q.size
 
 
 def test_other_files_are_refused(written, tmp_path):
     name = written("no mat file", "a.mat")
     with pytest.raises(InputError, match=r"a\.mat: not a \.mat file"):
-        build(name)
+        built(name)
     with pytest.raises(InputError, match=r"b\.mat: No such file"):
-        build("file:b.mat")
+        built("file:b.mat")
     (tmp_path / "a.qps").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"a\.qps: not UTF-8"):
-        build("file:a.qps")
+        built("file:a.qps")
 
 
 # names
@@ -652,7 +648,7 @@ SMALL = "beam-ring/Nr=2/Nh=1/steps=2"
 )
 def test_an_exported_qp_comes_back_exactly(written, command, form, suffix):
     assert command("export", f"{SMALL}/{form}", f"a.{suffix}")[0] == 0
-    original, back = build(f"{SMALL}/{form}"), build(f"file:a.{suffix}")
+    original, back = built(f"{SMALL}/{form}"), built(f"file:a.{suffix}")
 
     assert_same(back.qp, original.qp)
     assert (back.scale, back.constant) == (original.scale, original.constant)
@@ -718,18 +714,18 @@ def two_rows(tmp_path, monkeypatch):
 
 
 def test_a_row_of_a_parquet_file_is_a_case(two_rows):
-    first, second = (build(f"file:{two_rows}#{i}") for i in (1, 2))
+    first, second = (built(f"file:{two_rows}#{i}") for i in (1, 2))
 
     assert parse(f"file:{two_rows}#2", PROBLEMS).name == f"file:{two_rows}#2"
     assert value_of(first) == pytest.approx(-0.5)
     assert value_of(second) == pytest.approx(-2.0)
     with pytest.raises(InputError, match=r"two.parquet: has 2 problems; expected two"):
-        build(f"file:{two_rows}")
+        built(f"file:{two_rows}")
 
 
 def test_only_parquet_files_have_rows(written):
     with pytest.raises(InputError, match=r"a.qps#2: only Parquet files contain sev"):
-        build(f"{written(QPS, 'a.qps')}#2")
+        built(f"{written(QPS, 'a.qps')}#2")
 
 
 @pytest.mark.parametrize("path", ["two.parquet", "*.parquet"])
