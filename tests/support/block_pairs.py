@@ -16,7 +16,7 @@ def block_pair(
     """Write two blocks and their description; return the path of the description.
 
     The lower block is 1 m high and clamped at its base. The upper block slides along
-    its top, on which the pressure acts.
+    its top, on which the pressure acts. The ends are the faces across x of both blocks.
 
     lower, upper : interval of each horizontal axis, m
     cells : numbers of cells of both blocks along all axes
@@ -37,6 +37,10 @@ def block_pair(
         ends = {"lower": ("base", "table"), "upper": ("foot", "top")}[name]
         for side, at in zip(ends, (low, low + tall), strict=True):
             sides[side] = facets[np.isclose(z, at).all(axis=1)] + first
+        across = np.ptp(mesh.points[facets][..., 0], axis=1) == 0
+        sides["ends"] = np.concatenate(
+            [sides.get("ends", facets[:0]), facets[across] + first]
+        )
         bodies[name] = mesh.cells + first
         points.append(mesh.points)
         first += len(mesh.points)
@@ -46,7 +50,7 @@ def block_pair(
         sides |= {
             f"{side} left": sides[side][is_left], f"{side} right": sides[side][~is_left]
         }  # fmt: skip
-    used = {name for pair in contacts for name in pair} | {"base", "top"}
+    used = {name for pair in contacts for name in pair} | {"base", "top", "ends"}
     named = {name: facets for name, facets in sides.items() if name in used}
     flat = np.column_stack([points, np.zeros(len(points))])
     text = (

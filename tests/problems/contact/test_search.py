@@ -38,26 +38,14 @@ SIZES = [1, 2, 15, 16, 17, 64, 65, 257]
 def test_the_closest_segment_of_the_whole_chain_is_found(segments, roughness):
     rng = np.random.default_rng(577215)
     chain = arc(segments) + roughness * rng.standard_normal((segments + 1, 2))
+    around = np.concatenate([chain, [[1.0, -0.5]], chain[:1]])  # returns to its start
     x = rng.uniform(-1, 3, (200, 2))
-    closest = nearest(x, chain)
-    distance = all_pairs(x, chain)
-
-    start, edge = chain[closest.facet], np.diff(chain, axis=0)[closest.facet]
-    reached = np.linalg.norm(x - start - closest.N[:, 1:] * edge, axis=1)
-    assert reached == pytest.approx(distance.min(axis=1), rel=1e-12)
-
-
-def test_the_closest_segment_is_found_on_a_chain_that_returns_to_its_start():
-    theta = np.linspace(0, 2 * np.pi, 101)
-    circle = np.column_stack([np.cos(theta), np.sin(theta)])
-    circle[-1] = circle[0]
-    x = np.random.default_rng(141421).uniform(-2, 2, (100, 2))
-    closest = nearest(x, circle)
-
-    distance = all_pairs(x, circle)
-    assert np.take_along_axis(distance, closest.facet[:, None], 1)[:, 0] == (
-        pytest.approx(distance.min(axis=1), rel=1e-12)
-    )
+    for one in (chain, around):
+        closest = nearest(x, one)
+        start, edge = one[closest.facet], np.diff(one, axis=0)[closest.facet]
+        reached = np.linalg.norm(x - start - closest.N[:, 1:] * edge, axis=1)
+        least = all_pairs(x, one).min(axis=1)
+        assert reached == pytest.approx(least, rel=1e-12)
 
 
 def test_the_closest_segment_is_found_on_a_chain_with_loops():

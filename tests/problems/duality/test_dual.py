@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csc_array, csr_array
 
-from mortarbench.harness import QP, Solution, Status, no_rows
+from mortarbench.harness import QP, Solution, Status
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.linearise import linearisation
@@ -251,31 +251,6 @@ def test_a_known_free_displacement_changes_nothing():
     assert plain.constant == told.constant
 
 
-def test_the_reference_finds_the_planted_active_set():
-    """F is diagonal, so that x_i = max(0, d_i / F_ii)."""
-    F = np.array([1.0, 2.0, 4.0, 8.0])
-    d = np.array([3.0, -1.0, 2.0, -5.0])
-    qp = QP(P=np.diag(F), q=-d, A=no_rows(4), b=np.zeros(0), G=no_rows(4),
-            h=np.zeros(0), lb=np.zeros(4), ub=np.full(4, np.inf))  # fmt: skip
-
-    s = reference_solution(qp)
-
-    assert s.x == pytest.approx([3, 0, 0.5, 0])
-    assert s.z_box == pytest.approx([0, -1, 0, -5])
-    assert s.status is Status.SOLVED
-
-
-def test_the_reference_of_the_primal_is_recovered_from_its_dual():
-    primal = clamped_bar()
-    dual = dual_bounds(primal, regular_inverse(primal.P, np.arange(1, 12)))
-    back = dual.recover(reference_solution(dual.qp))
-
-    s = reference_solution(primal)
-
-    for name in ("x", "y", "z"):
-        assert getattr(s, name) == pytest.approx(getattr(back, name), abs=1e-13)
-
-
 def test_recovery_keeps_the_claim():
     primal = clamped_bar()
     dual = dual_bounds(primal, regular_inverse(primal.P, np.arange(1, 12)))
@@ -335,21 +310,3 @@ def test_a_path_of_many_steps_recovers_only_requested_steps(factorise, transform
     assert kkt_residuals(primal, last).worst <= 1e-6
     recovered(path.problem(3))
     assert inverse.solves == 3
-
-
-@pytest.mark.parametrize(
-    ("factorise", "transform"), [("floating", dualise), ("clamped", dual_bounds)]
-)
-def test_a_dual_solution_has_its_displacements_on_the_contact_sides(
-    factorise, transform
-):
-    family, geometry = PROBLEMS["beam-ring"], (3, 2, 4, "strain")
-    configured = family.with_keys(Nr=3, Nh=2)
-    primal = configured.build("primal", reference_solution).qp
-    dual = transform(primal, getattr(model(*geometry), factorise))
-    s = reference_solution(dual.qp)
-    sides, u = np.unique(primal.G.nonzero()[1]), dual.recover(s).x
-
-    assert dual.interface_displacement(s)[sides] == pytest.approx(
-        u[sides], abs=1e-9 * abs(u).max()
-    )

@@ -169,27 +169,17 @@ def test_the_residual_weights_gaps_by_shares_of_multipliers(equilibrium, size):
         assert found == pytest.approx(0.3 * share, rel=1e-9)
 
 
-def test_the_residual_without_contact_forces_is_that_of_the_load(equilibrium):
-    """The residual is ‖r‖/‖load‖, and components of r at supports do not count."""
+def test_the_residual_without_contact_forces_is_relative_to_the_load(equilibrium):
+    """Components of r at supports do not count; without load, the residual is ‖r‖."""
     path, at, lam = equilibrium
     load, held = path.bodies.f, path.bodies.fixed
     r = 0.125 * load
     r[held] = 1e6
-    found = path.residual(at._replace(gap=0 * at.gap, r=r), 0 * lam, 1.0)
-    free = np.delete(np.arange(r.size), held)
-    expected = 0.125 * np.linalg.norm(load[free]) / np.linalg.norm(load[free])
-    assert found == pytest.approx(expected, rel=1e-12)
-    twice = path.residual(at._replace(gap=0 * at.gap, r=r), 0 * lam, 2.0)
-    assert twice == pytest.approx(expected / 2, rel=1e-12)
-
-
-def test_without_load_and_contact_the_residual_is_the_force_itself(equilibrium):
-    path, at, lam = equilibrium
-    r = np.zeros_like(at.r)
-    free = np.setdiff1d(np.arange(r.size), path.bodies.fixed)
-    r[free[:2]] = 3.0, 4.0
     still = at._replace(gap=0 * at.gap, r=r)
-    assert path.residual(still, 0 * lam, 0.0) == pytest.approx(5.0)
+    size = 0.125 * np.linalg.norm(np.delete(load, held))
+    for factor, expected in ((1.0, 0.125), (2.0, 0.0625), (0.0, size)):
+        found = path.residual(still, 0 * lam, factor)
+        assert found == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_qp_of_an_iteration_models_the_potential():
@@ -282,20 +272,6 @@ def test_a_wrong_or_missing_answer_ends_the_load():
         other = replace(path, reference=reference)
         with pytest.raises(newton.NoEquilibriumError, match=message):
             other._solve(last.primal, other._inverse(last.tangent.K))
-
-
-def test_bodies_without_contact_need_no_reference_solution():
-    path = ring_path()
-    last = path.iterations(1)[-1]
-    rows = last.rows
-    nothing = rows._replace(
-        **{name: value[:0] for name, value in rows._asdict().items()}
-    )
-    alone = replace(path, gaps=newton.Gaps(lambda u: nothing), reference=None, steps=99)
-    found = alone.iterations(1)[-1]
-    at = alone._configuration(found.answer.x, 1 / 99, alone.gaps)
-    assert found.answer.z.size == 0
-    assert alone._free_norm(at.r) <= 1e-8 * alone._free_norm(path.bodies.f / 99)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
