@@ -15,6 +15,7 @@ from mortarbench.solvers.reference.operators import reference_of_operator
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.cases import built, solved
 from tests.support.gmsh_files import msh22, solids22, square, stacked_mesh
+from tests.support.refusals import refused
 from tests.support.solid_blocks import solid_blocks
 
 E, NU = 1e9, 0.3
@@ -481,10 +482,8 @@ def test_an_invalid_load_or_support_is_refused_in_one_line(old, new, message):
         text = "gravity = [0, -9]\n" + text
     assert text != Path("a.toml").read_text()
     Path("a.toml").write_text(text)
-    with pytest.raises(InputError) as e:
+    with refused(message):
         solved("bodies:a.toml/dual")
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from mortarbench.problems.elastic import FrictionLaw, one_step
 from mortarbench.problems.families.patch import model
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.refusals import refused
 
 PATCH = PROBLEMS["contact-patch"]
 STRETCHED = dict(lower=3, upper=2, ratio=3.0)
@@ -52,11 +53,8 @@ def test_a_case_of_one_step_equals_the_case_of_the_family(form, law, keys):
      (dict(kind="coulomb", mu=0.3), "expected the argument `reference`")],
 )  # fmt: skip
 def test_invalid_laws_are_refused_in_one_line(law, message):
-    with pytest.raises(InputError) as e:
+    with refused(message):
         one_step(model(PATCH.with_keys()), "dual", friction=FrictionLaw(**law))
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def test_friction_can_balance_a_tangential_load():

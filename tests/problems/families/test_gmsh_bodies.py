@@ -20,6 +20,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT
 from tests.support.cases import built
 from tests.support.gmsh_files import entities41, msh22, square, stacked_mesh
+from tests.support.refusals import refused
 from tests.support.triangles import halved
 
 NR, NH = 2, 1
@@ -364,11 +365,8 @@ def test_more_shear_than_friction_allows_is_refused_in_every_step(sheared_blocks
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_an_unbalanced_load_is_refused_before_solving(described, load, message, form):
     text = described(toml=FLOATING.replace("force = [0, -1e8]", load))
-    with pytest.raises(InputError, match=r"a\.toml: body 'beam': nothing") as e:
+    with refused(message, start="a.toml: body 'beam': nothing"):
         built(f"{text}/steps=1/{form}")
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize(
@@ -527,11 +525,8 @@ def test_a_bad_description_is_refused_with_file_entry_and_remedy(
 ):
     assert old in TOML
     text = described(toml=TOML.replace(old, new, 1))
-    with pytest.raises(InputError) as e:
+    with refused(message):
         built(f"{text}/dual")
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
@@ -633,11 +628,8 @@ def bent(points):
 def test_an_unsuitable_mesh_is_refused(tmp_path, contents, message):
     content = contents(*square())
     kinds = {"quad_type": content[4]} if len(content) > 4 else {}
-    with pytest.raises(InputError, match=r"m\.msh: ") as e:
+    with refused(message, start=f"{tmp_path}/m.msh: "):
         read(tmp_path, *content[:4], **kinds)
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def untagged(text):
@@ -691,13 +683,11 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
 def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
     text = described(toml=TOML.replace("two.msh", "two.geo"))
     Path("two.geo").write_text("Point(1) = {0, 0, 0};\n")
-    with pytest.raises(InputError) as e:
-        built(f"{text}/dual")
-
-    assert str(e.value) == (
+    with refused(
         "two.geo: a drawing, not a mesh; generate a mesh first: "
         "gmsh -2 two.geo writes two.msh"
-    )
+    ):
+        built(f"{text}/dual")
 
 
 def test_a_set_of_two_parts_becomes_two_bodies(tmp_path):
@@ -762,10 +752,8 @@ def test_other_files_are_refused(tmp_path, capsys):
 )
 def test_a_bad_name_is_refused(described, text, message):
     described()
-    with pytest.raises(InputError) as e:
+    with refused(message):
         parse(text, PROBLEMS)
-
-    assert message in str(e.value)
 
 
 def test_friction_is_the_same_from_the_key_the_file_or_the_pair(
@@ -806,11 +794,8 @@ def test_friction_is_the_same_from_the_key_the_file_or_the_pair(
 def test_a_law_of_a_pair_that_does_not_fit_is_refused_in_one_line(
     described, keys, pair, message
 ):
-    with pytest.raises(InputError) as e:
+    with refused(message):
         built(f"{described(toml=TOML + pair)}{keys}/dual")
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def test_friction_can_be_omitted_for_one_pair(described):

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import ContactPair
 from mortarbench.problems.contact.linearise import linearisation
@@ -19,6 +18,7 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.cases import built
 from tests.support.gmsh_files import msh22, solids22
+from tests.support.refusals import refused
 
 E, NU, PRESSURE = 1e9, 0.3, 1e6
 CELLS = 6, 3, 4
@@ -198,11 +198,8 @@ def test_one_side_may_press_on_two_rigid_bodies(tmp_path):
 )  # fmt: skip
 def test_a_wrong_rigid_body_is_refused_in_one_line(tmp_path, toml, old, new, message):
     assert old in toml
-    with pytest.raises(InputError) as e:
+    with refused(message):
         solve(block(tmp_path, toml.replace(old, new)))
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def against(problem, rigid):

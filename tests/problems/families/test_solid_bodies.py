@@ -12,6 +12,7 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.cases import built
 from tests.support.hexahedra import TETRAHEDRA, WEDGES
+from tests.support.refusals import refused
 from tests.support.solid_blocks import NU, PRESSURE, TOML, E, solid_blocks
 
 KINDS = {"tetra": TETRAHEDRA, "wedge": WEDGES, "hexahedron": None}
@@ -154,11 +155,8 @@ def test_settings_unsupported_for_volumes_are_refused_in_one_line(
     tmp_path, old, new, keys, message
 ):
     toml = TOML.replace(old, new) if old else TOML
-    with pytest.raises(InputError) as e:
+    with refused(message):
         built(f"bodies:{solid_blocks(tmp_path, TETRAHEDRA, toml)}{keys}/dual")
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def test_a_block_that_tips_over_an_edge_is_refused(tmp_path):

@@ -12,6 +12,7 @@ from tests.support.cases import built, solved
 from tests.support.gmsh_files import entities41, solids22, text22
 from tests.support.hexahedra import TETRAHEDRA, WEDGES
 from tests.support.mesh_formats import INSTANCES, write_inp, write_med
+from tests.support.refusals import refused
 from tests.support.solid_blocks import TOML, solid_blocks
 
 KINDS = {"tetra": TETRAHEDRA, "wedge": WEDGES, "hexahedron": None}
@@ -162,9 +163,8 @@ def test_sets_that_overlap_the_described_bodies_are_not_needed(tmp_path):
         ('boundary = "top"', 'point = "Body"', "point: unknown node set 'Body'"),
     ):  # fmt: skip
         path.write_text(TOML.replace("blocks.msh", "blocks.inp").replace(old, new))
-        with pytest.raises(InputError) as e:
+        with refused(message):
             built(f"bodies:{path}/dual")
-        assert message in str(e.value)
     body = TOML[TOML.index('[[bodies]]\nname = "upper"') : TOML.index("[[supports]]")]
     path.write_text(TOML.replace("blocks.msh", "blocks.inp").replace(body, ""))
     with pytest.raises(InputError, match=r"bodies: element set '.*' has no entry"):
@@ -212,12 +212,8 @@ def test_an_inp_file_that_cannot_be_read_is_refused_in_one_line(
 ):
     path = tmp_path / "a.inp"
     path.write_text(one_element("C3D8").replace(old, new, 1))
-    with pytest.raises(InputError) as e:
+    with refused(message, start=f"{path}: "):
         read_msh(path)
-
-    assert str(e.value).startswith(f"{path}: ")
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def test_sets_of_sets_without_end_are_refused(tmp_path):
@@ -305,11 +301,8 @@ def outside(file, step):
 def test_a_med_file_that_cannot_be_read_is_refused_in_one_line(
     tmp_path, change, message
 ):
-    with pytest.raises(InputError) as e:
+    with refused(message):
         read_msh(med(tmp_path, change))
-
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def test_other_content_is_not_a_med_file(tmp_path):

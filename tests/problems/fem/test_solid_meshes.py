@@ -13,6 +13,7 @@ from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.reports.export.vtu import write_vtu
 from tests.support.gmsh_files import solids22
 from tests.support.hexahedra import TETRAHEDRA, WEDGES, divided
+from tests.support.refusals import refused
 
 D = elasticity_matrix(Material(E=1.0, nu=0.3), None)
 
@@ -118,10 +119,8 @@ def test_mirrored_cells_are_turned(tmp_path, kind):
 def test_unreadable_files_are_refused_in_one_line(tmp_path, change, message):
     cube = cut()
     body = Mesh(cube.points, change(cube.cells), cube.boundaries)
-    with pytest.raises(InputError) as e:
+    with refused(message):
         read_msh(write(tmp_path / "a.msh", {"block": body}))
-    assert message in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 def test_volumes_without_a_name_are_refused(tmp_path):

@@ -34,6 +34,7 @@ from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.cases import built
+from tests.support.refusals import refused
 
 #: example from the report of Maros and Mészáros with further rows, ranges and bounds;
 #: contains every type of row
@@ -256,9 +257,8 @@ def test_a_compressed_file_is_the_file(written, tmp_path, name):
     ],
 )
 def test_unknown_formats_are_refused_compressed_or_not(written, name, message):
-    with pytest.raises(InputError) as e:
+    with refused(message):
         built(written("", name))
-    assert message in str(e.value)
 
 
 def test_the_name_of_a_set_may_be_left_out():
@@ -422,11 +422,8 @@ def test_a_bad_qps_text_is_refused_with_its_line(written, old, new, message):
     text = QPS.replace(old, new, 1)
     if message is None:
         text, message = text.replace(" N  ignored\n", " G  ignored\n"), "no row of type"
-    with pytest.raises(InputError) as e:
+    with refused(start=f"a.qps: {message}"):
         built(written(text, "a.qps"))
-
-    assert str(e.value).startswith(f"a.qps: {message}")
-    assert "\n" not in str(e.value)
 
 
 # Maros-Mészáros in .mat
@@ -521,11 +518,8 @@ def test_limits_near_1e20_are_infinite(written):
 )
 def test_an_invalid_mat_file_is_named_with_the_error(written, changes, message):
     content = {k: v for k, v in (MAT | changes).items() if v is not None}
-    with pytest.raises(InputError) as e:
+    with refused(start=f"a.mat: {message}"):
         built(written(content, "a.mat"))
-
-    assert str(e.value).startswith(f"a.mat: {message}")
-    assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize(
@@ -549,11 +543,8 @@ def test_a_qp_that_is_not_convex_is_refused(written, P, message):
     maximum."""
     n = P.shape[0]
     free = {"A": eye_array(n), "l": -np.ones(n), "u": np.ones(n), "q": np.zeros(n)}
-    with pytest.raises(InputError) as e:
+    with refused(start=f"a.mat: P is not positive semidefinite: {message}"):
         built(written({"P": csc_matrix(P), **free}, "a.mat"))
-
-    expected = f"a.mat: P is not positive semidefinite: {message}"
-    assert str(e.value).startswith(expected)
 
 
 @pytest.mark.parametrize(

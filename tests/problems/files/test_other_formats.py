@@ -17,6 +17,7 @@ from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.files.readers import read
 from mortarbench.solvers import SOLVERS
+from tests.support.refusals import refused
 
 OPTIMUM = 4.371875
 CLARABEL = {
@@ -103,10 +104,8 @@ LOWER = {"m": 2, "n": 2, "colptr": [0, 2, 3], "rowval": [0, 1, 1], "nzval": [8, 
     ],
 )  # fmt: skip
 def test_a_bad_problem_of_clarabel_is_refused_in_one_line(loaded, changes, message):
-    with pytest.raises(InputError) as e:
+    with refused(start=f"a.json: {message}"):
         loaded(CLARABEL | changes, "a.json")
-    assert str(e.value).startswith(f"a.json: {message}")
-    assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", "{", '{"P": NaN}', "[" * 1000])
