@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness import QP, Solution, Status, Vector
+from mortarbench.harness import QP, Matrix, Solution, Status, Vector
 from mortarbench.solvers.common.stopping import relative_residual
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.elimination import Eliminated, eliminate_free
@@ -32,9 +32,9 @@ from mortarbench.solvers.smalbe.projected import (
     Spectrum,
     by_lanczos,
     projected_problem,
-    times_projected,
+    unchanged,
 )
-from mortarbench.solvers.smalbe.spectrum import random_start
+from mortarbench.solvers.smalbe.rows import Rows
 
 STEPS = {
     "c": "cg",
@@ -64,10 +64,17 @@ MAX_IDLE_TIGHTENINGS = 3
 class Carry(NamedTuple):
     """Data that a problem of a sequence passes to the next problem."""
 
-    x: Vector  #: (n,)
-    side: NDArray[np.int8]  #: (n,) −1 at the lower bound, 1 at the upper bound, else 0
-    force: Vector  #: Cᵀa (n,) with the multipliers a of Cx = Cx̃
+    A: Matrix
+    b: Vector
+    rows: Rows  #: of A and b
     spectrum: Spectrum
+    solution: Solution
+
+    def rows_of(self, qp: QP) -> Rows | None:
+        """Return the rows if they are also those of `qp`, otherwise None."""
+        if not qp.b.size or not np.array_equal(self.b, qp.b):
+            return None
+        return self.rows if unchanged(self.A, qp.A) else None
 
 
 class Residuals(NamedTuple):
@@ -100,13 +107,10 @@ def prepared(
     options: Options,
     carry: Carry | None,
     *,
-    in_sequence: bool,
     eliminates: bool = True,
 ) -> Solve:
     """Prepare a run: project the QP and estimate the spectrum.
 
-    in_sequence : True if later QPs reuse the results; an accurate spectrum is then
-        worth its additional cost
     eliminates : True to eliminate free variables first if there are discs and P is
         dense. This takes 0.03 of the time on `hertz-sphere` with n = 8 and 0.9 of the
         time in the geometric mean of 72 problems with discs
@@ -115,13 +119,13 @@ def prepared(
         options = _on_discs(qp, options)
         plain = options.preconditioner == "none" and not options.is_extended
         if eliminates and plain and (small := eliminate_free(qp)) is not None:
-            inner = prepared(small.qp, tol, options, carry, in_sequence=in_sequence)
+            inner = prepared(small.qp, tol, options, carry)
             return partial(_solve_without_free, qp, tol, options, small, inner)
     rho = options.rho or (PRECONDITIONED_RHO if preconditioned_operator(qp) else RHO)
     history = History() if options.history else None
-    if carry is not None and carry.x.size != qp.q.size:
+    if carry is not None and carry.solution.x.size != qp.q.size:
         carry = None
-    steps = _lanczos_steps(options, qp, in_sequence=in_sequence)
+    steps = _lanczos_steps(options, qp)
     problem = _projected(qp, options, steps, carry)
     if not problem.rows.consistent:
         message = "the equality rows contradict each other"
@@ -148,9 +152,7 @@ def _solve_without_free(
     if s.status is Status.SOLVED:
         s = small.recover(s)
     if s.status is not Status.SOLVED or not relative_residual(qp, s, tol) <= tol:
-        s, left = prepared(
-            qp, tol, options, None, in_sequence=False, eliminates=False
-        )()
+        s, left = prepared(qp, tol, options, None, eliminates=False)()
         spent["P_products"] += s.counts.get("P_products", 0)
         iterations += s.iterations or 0
     return replace(s, iterations=iterations, counts={**s.counts, **spent}), left
@@ -187,7 +189,7 @@ def _projected(qp: QP, options: Options, steps: int, carry: Carry | None) -> Pro
         # q is closer to the first eigenvector than a random vector is; without rows, no
         # step depends on the norm
         find = partial(by_lanczos, steps=steps if qp.b.size else 1, start=qp.q)
-    problem = projected_problem(qp, find)
+    problem = projected_problem(qp, find, carry and carry.rows_of(qp))
     problem.preconditioner = kind
     return problem
 
@@ -207,15 +209,17 @@ def _estimated_spectrum(
     correct a wrong model.
     """
     if carry is not None and options.expansion == "model":
-        previous, rows = carry.spectrum.ritz, C.source
-        v = rows.project(random_start(rows.x_tilde.size))
-        quotient = float(v @ times_projected(F, rows, v)) / float(v @ v or 1.0)
-        if previous and 0.5 * previous.at_start < quotient < 2 * previous.at_start:
-            return carry.spectrum.orthogonal_to(rows)
+        previous, now = carry.spectrum.ritz, by_lanczos(F, C, steps=1).ritz
+        if (
+            previous
+            and now
+            and 0.5 * previous.at_start < now.at_start < 2 * previous.at_start
+        ):
+            return carry.spectrum
     return by_lanczos(F, C, steps=steps)
 
 
-def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
+def _lanczos_steps(options: Options, qp: QP) -> int:
     """Return the maximum number of Lanczos steps for this problem.
 
     For few unknowns, more steps would cost as much as CG. Few steps also suffice if P
@@ -230,7 +234,7 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     """
     if preconditioned_operator(qp) or options.expansion == "spectral":
         few = 0
-    elif qp.b.size or in_sequence:
+    elif qp.b.size:
         few = qp.q.size // 6
     else:
         few = qp.q.size // 10
@@ -240,17 +244,19 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
 def _start(task: _Task, tol: float) -> Iterate:
     """Return the starting point: zero, or the solution of the previous problem.
 
-    A component that was at a bound starts at the same bound, even if the value of this
-    bound has changed: slipping nodes usually continue to slip when the friction bound
-    changes.
+    A component that was pushed to a bound starts at the same bound, even if the value
+    of this bound has changed: slipping nodes usually continue to slip when the friction
+    bound changes. At a solution, ‖𝒫F𝒫‖μ = −Cz.
     """
     problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
-    x, mu = np.zeros(problem.F.n), np.zeros(len(problem.rows.C))
-    if carry is not None:
-        lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
-        x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))
-        x = np.where(np.isfinite(x), x, carry.x)
-        mu = problem.rows.C @ carry.force / problem.spectrum.norm
+    if carry is None:
+        x, mu = np.zeros(problem.F.n), np.zeros(len(problem.rows.C))
+    else:
+        x, z = carry.solution.x, carry.solution.z_box
+        mu = -(problem.rows.C @ z) / problem.spectrum.norm
+        if problem.discs:  # their multipliers belong to no bound
+            z = np.where(np.isinf(task.qp.lb) & np.isinf(task.qp.ub), 0.0, z)
+        x = np.where(z, np.copysign(np.inf, z), x)
     return task.loop.first(x, mu, M=task.options.M, rho=rho)
 
 
@@ -350,7 +356,7 @@ def _solve_to_tolerance(
         residuals = _residuals(task, point, Fx, tol)
         worst = max(residuals.gradient, residuals.rows)
         if worst <= tol:
-            return _counted(task, point), partial(_carry, task, at)
+            return _counted(task, point), partial(_carry, task, point)
         waited = 0 if worst < 0.9 * best else waited + 1
         best = min(best, worst)
         if at.status is not Status.SOLVED or waited == MAX_IDLE_TIGHTENINGS:
@@ -394,19 +400,9 @@ def _nothing() -> None:
     """Return None instead of a `Carry` after a failed run."""
 
 
-def _carry(task: _Task, at: Iterate) -> Carry:
-    problem = task.problem
-    lower, upper = problem.bounds
-    side = (at.nu >= upper).astype(np.int8) - (at.nu <= lower).astype(np.int8)
-    fixed = lower == upper
-    side[fixed] = -np.sign(at.g[fixed])  # the bound towards which −g points
-    x = problem.rows.x_tilde + at.nu
-    return Carry(
-        x=x,
-        side=side,
-        force=problem.spectrum.norm * (problem.rows.C.T @ task.loop.multipliers(at)),
-        spectrum=problem.spectrum,
-    )
+def _carry(task: _Task, point: Solution) -> Carry:
+    qp, problem = task.qp, task.problem
+    return Carry(qp.A, qp.b, problem.rows, problem.spectrum, point)
 
 
 def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:

@@ -146,6 +146,11 @@ cdef class SMALBE(MPRGP):
             memcpy(basis.U, self.rows.C, r * n * sizeof(double))
             if kept:
                 memcpy(basis.U + r * n, read(ritz.vectors, owners), kept * n * sizeof(double))
+            for i in range(r, r + kept):  # vectors of an earlier QP have other rows C
+                rows_times(basis.U, basis.U + i * n, basis.c, i, n)
+                add_combination(-1.0, basis.U, basis.c, basis.U + i * n, i, n)
+                scale(1 / (sqrt(dot(basis.U + i * n, basis.U + i * n, n)) or 1.0),
+                      basis.U + i * n, n)
             # share one copy, so that it stays in the cache
             self.basis, self.rows.C = basis, basis.U
             self.rows.owners.append(basis)
@@ -201,13 +206,15 @@ cdef class SMALBE(MPRGP):
     # the start
 
     def begin(self, x, mu, double rho):
-        """Return ν = Π(x) − x̃ (n,), where Π projects onto the set, and the gradient.
+        """Return ν near Π(x) − x̃ (n,), where Π projects onto the set, and the gradient.
 
         The gradient includes Cᵀμ. The call takes one product, or no product for x = 0,
-        where 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν.
+        where 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν. Infinite components of x start at their bound,
+        or at x̃ if it is infinite. A start ν ≠ −x̃ also moves towards Cν = 0 on its face.
         """
         cdef Py_ssize_t i, n = self.n
         cdef list owners = []
+        cdef Parts parts
         start, gradient = empty(n), zeros(n)
         cdef bint moved = False
         cdef double *nu = address(start)
@@ -217,8 +224,12 @@ cdef class SMALBE(MPRGP):
         self.rho = rho
         self.set.project(read(x, owners), 1.0, self.rows.x_tilde, nu)
         for i in range(n):
+            if isinf(nu[i]):
+                nu[i] = fmin(fmax(0.0, self.lower[i]), self.upper[i])
             moved = moved or nu[i] + self.rows.x_tilde[i] != 0
         if moved:
+            self.set.split(nu, nu, 1.0, self.phi, self.free, &parts)
+            self.move_onto_rows(nu, self.free, self.s)
             self.H(nu, g)
         else:  # 𝒫F𝒫ν = 0
             self.rows.times(nu, self.Cv)
@@ -419,15 +430,31 @@ cdef class SMALBE(MPRGP):
         self.directions.begin(self.free)  # H has changed
         return 0
 
+    cdef int move_onto_rows(self, double *nu, const double *free, double *v) except -1:
+        """Move ν towards Cν = 0 on the face with the mask `free`; v (n,) is workspace.
+
+        Projections onto {Cν = 0} and onto the free components alternate (von Neumann)
+        as long as a pair halves ‖Cν‖. Active bounds and discs remain active.
+        """
+        cdef double error, before = INFINITY
+        self.rows.times(nu, self.Cv)
+        error = self.rows.size(self.Cv)
+        while 0 < 2 * error < before:
+            memset(v, 0, self.n * sizeof(double))
+            self.rows.add(1.0, self.Cv, v)
+            masked(free, v, v, self.n)
+            self.set.project(nu, 1.0, v, nu)
+            self.rows.times(nu, self.Cv)
+            before, error = error, self.rows.size(self.Cv)
+        return 0
+
     # recovery
 
     def point(self, nu, mu, double rho, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
-        First, ν moves towards Cν = 0 on its face: the outer loop ends with ‖Cν‖ of the
-        order of the tolerance, which is the error of the force balance. Projections
-        onto {Cν = 0} and onto the free components alternate (von Neumann) as long as a
-        pair halves ‖Cν‖. Active bounds and discs remain active.
+        First, ν moves towards Cν = 0 on its face, because the outer loop ends with ‖Cν‖
+        of the order of the tolerance, which is the error of the force balance.
 
         For a = ‖𝒫F𝒫‖(μ + ρCν) − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient of the
         projected problem up to rounding and terms of the order of ‖Cν‖. On the free
@@ -450,20 +477,13 @@ cdef class SMALBE(MPRGP):
         cdef double *rest = self.s
         cdef double *free = self.x2
         cdef double *da = self.Cv
-        cdef double square, push, error, before = INFINITY
+        cdef double square, push
         memcpy(v, read(nu, owners), n * sizeof(double))
         self.set.split(v, v, 1.0, self.t, free, &parts)
         self.rows.times(v, da)
         for i in range(r):
             a[i] = self.norm * (at_mu[i] + rho * da[i])
-        error = self.rows.size(da)
-        while 0 < 2 * error < before:
-            memset(rest, 0, n * sizeof(double))
-            self.rows.add(1.0, da, rest)
-            masked(free, rest, rest, n)
-            self.set.project(v, 1.0, rest, v)
-            self.rows.times(v, da)
-            before, error = error, self.rows.size(da)
+        self.move_onto_rows(v, free, rest)
         for i in range(n):  # x̃ + ν may differ from a bound in the last bit
             x[i] = fmin(fmax(self.rows.x_tilde[i] + v[i], least[i]), most[i])
             if v[i] >= self.upper[i]:

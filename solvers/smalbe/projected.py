@@ -9,24 +9,22 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import issparse
 
-from mortarbench.harness import QP, Discs, Status, Vector
+from mortarbench.harness import QP, Discs, Matrix, Status, Vector
 from mortarbench.harness.operators import is_semidefinite
 from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.compiled import Product
 from mortarbench.solvers.smalbe.preconditioner import Preconditioner
 from mortarbench.solvers.smalbe.rows import (
-    DenseRows,
     Rows,
+    SparseRows,
     equality_rows,
     is_sparse,
     orthonormal_rows,
 )
 from mortarbench.solvers.smalbe.spectrum import Ritz, random_start
-
-#: largest component of Ritz vectors along rows that counts as rounding
-ORTHOGONAL = 1e-12
 
 
 class Spectrum(NamedTuple):
@@ -34,20 +32,6 @@ class Spectrum(NamedTuple):
 
     norm: float  #: ‖𝒫F𝒫‖, positive
     ritz: Ritz | None  #: upper Ritz pairs; None if they were not computed
-
-    def orthogonal_to(self, rows: Rows) -> Spectrum:
-        """Return the spectrum with Ritz vectors projected onto the kernel of `rows`.
-
-        For sparse rows, the spectrum is returned unchanged.
-        """
-        if self.ritz is None or not isinstance(rows, DenseRows):
-            return self
-        along = rows.C @ self.ritz.vectors.T
-        if np.abs(along).max(initial=0.0) <= ORTHOGONAL:
-            return self
-        V, R = np.linalg.qr(rows.project(self.ritz.vectors.T))
-        vectors = np.ascontiguousarray((V * np.sign(np.diag(R))).T)
-        return self._replace(ritz=self.ritz._replace(vectors=vectors))
 
 
 @dataclass(eq=False)
@@ -111,22 +95,29 @@ class Iterate(NamedTuple):
 
 
 def projected_problem(
-    qp: QP, find: Callable[[Product, compiled.Rows], Spectrum]
+    qp: QP,
+    find: Callable[[Product, compiled.Rows], Spectrum],
+    known: Rows | None = None,
 ) -> Projected:
     """Homogenise, project and normalise a QP.
 
     If x̃ ≠ 0, this takes one product in addition to the products of `find`.
 
     find : function that returns the spectrum of 𝒫F𝒫, such as `by_lanczos`
+    known : the rows of an earlier QP with the same A and b, or None
     """
     F = Product(qp.P, qp.q.size)
     discs = tuple(one for one in qp.sets if isinstance(one, Discs))
     rows: Rows
     if is_sparse(qp.A):
         lower, upper = hull(qp.sets, qp.q.size)
-        rows = equality_rows(qp.A, qp.b, np.isfinite(lower) | np.isfinite(upper))
+        bounded = np.isfinite(lower) | np.isfinite(upper)
+        if isinstance(known, SparseRows):
+            same = np.array_equal(known.bounded, np.flatnonzero(bounded))
+            known = known if same else None
+        rows = known or equality_rows(qp.A, qp.b, bounded)
     else:
-        rows = orthonormal_rows(qp.A, qp.b)
+        rows = known or orthonormal_rows(qp.A, qp.b)
     C, diagonal = compiled.Rows(rows), _diagonal(qp)
     spectrum, box = find(F, C), qp.box
     b, bounds, norm = compiled.homogenised(
@@ -168,6 +159,11 @@ def by_lanczos(
     return Spectrum(ritz.norm or 1.0, ritz)
 
 
-def times_projected(F: Product, rows: Rows, v: Vector) -> Vector:
-    """Return 𝒫F𝒫v."""
-    return rows.project(F(rows.project(v)))
+def unchanged(A: Matrix, B: Matrix) -> bool:
+    """Return True if two matrices have the same entries, stored in the same way."""
+    if A is B or A.shape != B.shape:
+        return A is B
+    if not issparse(A) or not issparse(B) or A.format != B.format:
+        return type(A) is type(B) and np.array_equal(A, B)
+    parts = ("data", "indices", "indptr")
+    return all(np.array_equal(getattr(A, p), getattr(B, p)) for p in parts)

@@ -68,7 +68,7 @@ class SMALBE(Options):
         return missing_data(qp, self.preconditioner)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        solve = prepared(qp, tol, self, None, in_sequence=False)
+        solve = prepared(qp, tol, self, None)
         return lambda: solve()[0]
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
@@ -79,7 +79,7 @@ class SMALBE(Options):
         carry: Carry | None = None
 
         def prepare(qp: QP) -> Callable[[], Solution]:
-            solve = prepared(qp, tol, self, carry, in_sequence=True)
+            solve = prepared(qp, tol, self, carry)
 
             def run() -> Solution:
                 nonlocal carry

@@ -155,7 +155,7 @@ def test_warm_starts_save_products_with_equality_rows():
 
     for qp, s in zip(qps, warm, strict=True):
         assert kkt_residuals(qp, s).worst <= 10 * TOL
-    assert products(warm) <= 0.67 * products(cold)
+    assert products(warm) <= 0.63 * products(cold)
 
 
 def test_a_sequence_with_one_equation_reuses_the_previous_spectrum():

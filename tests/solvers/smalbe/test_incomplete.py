@@ -313,7 +313,7 @@ def test_the_unit_of_a_variable_changes_nothing(seed):
     ("case", "most"),
     [
         ("journal-bearing/n=50/eccentricity=0.9", 20),
-        ("journal-bearing/n=100/eccentricity=0.9", 33),
+        ("journal-bearing/n=100/eccentricity=0.9", 30),
         ("journal-bearing/n=100/eccentricity=0.5", 45),
         ("journal-bearing/n=100/eccentricity=0.99", 40),
         ("journal-bearing/n=50", 45),

@@ -14,7 +14,6 @@ from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.projected import (
     by_lanczos,
     projected_problem,
-    times_projected,
 )
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -95,7 +94,8 @@ def test_the_lagrangian_is_that_of_the_point(outer_loop, most):
     problem = problem_of(drawn(314159))
     at = outer_loop(problem, np.zeros(60), tol=1e-8, max_steps=most)
     Cnu, rho = problem.rows.C @ at.nu, at.outer[-1].rho
-    A_nu = times_projected(problem.F, problem.rows, at.nu) / problem.spectrum.norm
+    project = problem.rows.project
+    A_nu = project(problem.F(project(at.nu))) / problem.spectrum.norm
     L = 0.5 * (at.nu @ A_nu + rho * Cnu @ Cnu) - problem.b @ at.nu + at.mu @ Cnu
 
     assert at.outer[-1].lagrangian == pytest.approx(L, rel=1e-10)

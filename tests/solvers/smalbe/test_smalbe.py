@@ -18,7 +18,6 @@ from mortarbench.solvers.smalbe import driver
 from mortarbench.solvers.smalbe.projected import (
     by_lanczos,
     projected_problem,
-    times_projected,
 )
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -34,7 +33,9 @@ def hessian(problem, rho):
     """Return H (n, n)."""
     C, N = problem.rows.C, problem.spectrum.norm
     columns = np.eye(problem.b.size)
-    PFP = [times_projected(problem.F, problem.rows, v) / N for v in columns]
+    PFP = [
+        problem.rows.project(problem.F(problem.rows.project(v))) / N for v in columns
+    ]
     return np.column_stack(PFP) + rho * C.T @ C
 
 
