@@ -44,11 +44,6 @@ class TornDual:
         """The torn bodies."""
         return self.served.torn
 
-    @cached_property
-    def free(self) -> Vector:
-        """K⁺f (N,), the displacement without multipliers."""
-        return self.torn.apply("inverse", self.torn.f)
-
     @property
     def R(self) -> csr_array:
         """Rigid motions (N, r) of all subdomains; not stored, since they are large."""
@@ -63,17 +58,28 @@ class TornDual:
         E = self.torn.rows.equalities
         return multiplier_sets(E, normals, bound, contact.tangents)
 
-    @cached_property
+    @property
     def qp(self) -> QP:
         """The dual QP."""
-        (B, c, _), R = self.torn.rows, self.R
-        return QP(
+        return self._qp_and_constant[0]
+
+    @property
+    def constant(self) -> float:
+        """−½fᵀK⁺f, the negative objective of the dual minus that of the primal QP."""
+        return self._qp_and_constant[1]
+
+    @cached_property
+    def _qp_and_constant(self) -> tuple[QP, float]:
+        (B, c, _), R, f = self.torn.rows, self.R, self.torn.f
+        free = self.torn.apply("inverse", f)  # displacement without multipliers
+        qp = QP(
             P=operator_of(self.served),
-            q=c - B @ self.free,
+            q=c - B @ free,
             A=csr_array((B @ R).T),
-            b=R.T @ self.torn.f,
+            b=R.T @ f,
             sets=self.sets,
         )
+        return qp, -0.5 * float(f @ free)
 
     def displacement(self, s: Solution) -> Vector:
         """Return u = (TᵀT)⁻¹Tᵀv (n,), the average over the copies of each node.
@@ -115,8 +121,7 @@ def feti_dual(
         reactions = -primal.A @ (primal.P @ u + primal.q + B_I.T @ z)
         return replace(s, x=u, y=reactions, z=z, z_box=np.zeros(u.size))
 
-    constant = -0.5 * float(dual.torn.f @ dual.free)
-    return Transformed(dual.qp, recover, -1.0, constant, dual.displacement)
+    return Transformed(dual.qp, recover, -1.0, dual.constant, dual.displacement)
 
 
 def digest_of(served: Served, torn: TornBodies, others: int = 0) -> str:

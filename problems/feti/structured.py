@@ -50,47 +50,57 @@ def _shaping(parts: tuple[Mesh, ...], most: int, share: Vector) -> Shaping:
 
     share : (parts,) C₁₁/(C₁₁ + C₆₆) of each body
     """
-    sides = np.concatenate([spacings(part.grid) for part in parts])
-    interfaces, borders = (
-        np.concatenate([lines(part.divisions, most, ends=ends) for part in parts])
-        for ends in (False, True)
-    )
-    of_node = np.repeat(share, [len(part.points) for part in parts])
+    first = np.cumsum([0, *(len(part.points) for part in parts)])
 
     def factors(node: Nodes, supports: bool) -> Vector:
-        at = (borders if supports else interfaces)[node]
-        return shape_factors(sides[node], at, of_node[node])
+        result = np.empty(node.size)
+        of_node = np.searchsorted(first, node, side="right") - 1
+        for k, part in enumerate(parts):
+            selected = of_node == k
+            at = np.divmod(node[selected] - first[k], part.grid.shape[1])
+            marks = lines(part.divisions, most, at, ends=supports)
+            sides = spacings(part.grid, at)
+            result[selected] = shape_factors(sides, marks, share[k])
+        return result
 
     return factors
 
 
-def lines(divisions: tuple[int, ...], most: int, *, ends: bool) -> NDArray[np.bool_]:
-    """Return masks (N, 2) of the nodes whose row, or column, separates blocks.
+def lines(
+    divisions: tuple[int, ...], most: int, at: tuple[Nodes, Nodes], *, ends: bool
+) -> NDArray[np.bool_]:
+    """Return masks (k, 2) of the nodes whose row, or column, separates blocks.
 
+    at : rows (k,) and columns (k,) of the nodes
     ends : also mark the sides of the grid, as required for rows of supports
     """
     columns, rows = (np.full(cells + 1, ends) for cells in divisions)
     for line in (columns, rows):
         line[1:-1] = np.diff(blocks((line.size - 1,), most)) != 0
-    return np.stack(np.broadcast_arrays(rows[:, None], columns), axis=-1).reshape(-1, 2)
+    return np.stack([rows[at[0]], columns[at[1]]], axis=-1)
 
 
-def spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return, for each node, the mean lengths of its edges along its row and column.
+def spacings(
+    points: NDArray[np.float64], at: tuple[Nodes, Nodes]
+) -> NDArray[np.float64]:
+    """Return the mean lengths (k, 2) of the edges at nodes along rows and columns.
 
-    The result is (l·k, 2).
+    Parameters
+    ----------
+    points : (l, m, 2) points of l rows and m columns of nodes
+    at : rows (k,) and columns (k,) of the nodes
 
-    points : (l, k, 2) points of l rows and k columns of nodes
     """
-    lengths = np.empty(points.shape)
-    for component, axis in ((0, 1), (1, 0)):
-        edges = np.linalg.norm(np.diff(points, axis=axis), axis=2)
-        before = edges.take([0], axis), edges
-        after = edges, edges.take([-1], axis)
-        lengths[..., component] = (
-            sum(np.concatenate(e, axis) for e in (before, after)) / 2
-        )
-    return lengths.reshape(-1, 2)
+    row, column = at
+    last_row, last_column = (count - 2 for count in points.shape[:2])
+    lengths = np.zeros((row.size, 2))
+    for i in (np.maximum(row - 1, 0), np.minimum(row, last_row)):
+        edges = points[i + 1, column] - points[i, column]
+        lengths[:, 1] += np.linalg.norm(edges, axis=1)
+    for j in (np.maximum(column - 1, 0), np.minimum(column, last_column)):
+        edges = points[row, j + 1] - points[row, j]
+        lengths[:, 0] += np.linalg.norm(edges, axis=1)
+    return lengths / 2
 
 
 def shape_factors(

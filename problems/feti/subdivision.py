@@ -71,7 +71,8 @@ class Subdivision:
     @cached_property
     def _has(self) -> csr_array:
         """Matrix (S, N) with an entry for each copy: its index in `torn`."""
-        cells, label = self.mesh.cells, self.label
+        # 32 bits, because tables of large meshes take much memory
+        cells, label = self.mesh.cells.astype(np.int32), self.label.astype(np.int32)
         corners = cells.shape[1] * np.arange(len(cells) + 1)
         # with Boolean entries, products keep an entry for every common node
         nodes = csr_array(
@@ -81,7 +82,8 @@ class Subdivision:
         one = np.ones(label.size, dtype=bool)
         has = csr_array(csr_array((one, (label, np.arange(label.size)))) @ nodes)
         has.sort_indices()
-        return csr_array((np.arange(has.nnz), has.indices, has.indptr), shape=has.shape)
+        entries = np.arange(has.nnz, dtype=np.int32)
+        return csr_array((entries, has.indices, has.indptr), shape=has.shape)
 
     @cached_property
     def _copies(self) -> csc_array:
@@ -96,7 +98,7 @@ class Subdivision:
         copy = np.empty(has.nnz, dtype=np.int32)
         first = np.repeat(copies.indptr[:-1], several)
         copy[copies.data] = np.arange(has.nnz) - first
-        number = has.indices.astype(np.int64)
+        number = has.indices
         subdomain = np.repeat(np.arange(self.count, dtype=np.int32), self.sizes)
         return TornNodes(subdomain, number, several[number], copy)
 
@@ -147,7 +149,7 @@ class Subdivision:
     @cached_property
     def _before(self) -> NDArray[np.int64]:
         multiplicity = np.diff(self._copies.indptr)
-        before = np.empty(self.nodes, dtype=np.int64)
+        before = np.empty(self.nodes, dtype=np.int32)
         for m in np.unique(multiplicity):
             nodes = np.flatnonzero(multiplicity == m)
             before[nodes] = np.arange(nodes.size)
