@@ -42,6 +42,11 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
             spec = with_history(spec, solvers)
         solver = resolve(spec, solvers)
 
+    if ranks > 1:  # all ranks import at the same time what they need later
+        from mortarbench.problems.feti import elastic, served
+
+        del elastic, served
+
     def build(case: Mapping[str, Any], team: Team) -> Case:
         from mortarbench.solvers.reference.operators import reference_of_operator
 

@@ -313,6 +313,11 @@ class Subdomains(Split):
         self._rows, self._R = rows, csr_array(parts.kernel[rows])
         self._Z = csr_array(W - WT @ (diags_array(inverse) @ WT.T))
 
+    @cached_property
+    def _precise(self) -> csr_array:
+        """T in extended precision."""
+        return csr_array(in_precision(self._T, Real))
+
     @property
     def _squares(self) -> csr_array:
         """Squares of the entries of T, (N, n); not stored, because T is large."""
@@ -343,11 +348,11 @@ class Subdomains(Split):
 
     def spread(self, u: Extended) -> Extended:
         """Return Tu (N,)."""
-        return np.asarray(in_precision(self._T, Real) @ u)
+        return np.asarray(self._precise @ u)
 
     def joined(self, b: Extended) -> Extended:
         """Return Tᵀb (n,) with zeros on fixed components."""
-        return self.free(in_precision(self._T, Real).T @ b)
+        return self.free(self._precise.T @ b)
 
     def averaged(self, v: Extended) -> Extended:
         """Return averages (n,) after the subdomains have moved rigidly.

@@ -45,11 +45,6 @@ class TornDual:
         return self.served.torn
 
     @property
-    def R(self) -> csr_array:
-        """Rigid motions (N, r) of all subdomains; not stored, since they are large."""
-        return self.torn.kernel()
-
-    @property
     def sets(self) -> tuple[ConvexSet, ...]:
         """The sets of the multipliers: λ_n ≥ 0, ‖λ_t‖ ≤ g/scale."""
         contact = self.torn.problem.contact
@@ -70,7 +65,7 @@ class TornDual:
 
     @cached_property
     def _qp_and_constant(self) -> tuple[QP, float]:
-        (B, c, _), R, f = self.torn.rows, self.R, self.torn.f
+        (B, c, _), R, f = self.torn.rows, self.torn.kernel(), self.torn.f
         free = self.torn.apply("inverse", f)  # displacement without multipliers
         qp = QP(
             P=operator_of(self.served),
@@ -88,7 +83,7 @@ class TornDual:
         RᵀBᵀλ = Rᵀf. At the solution, all copies are equal.
         """
         B, T, f = self.torn.rows.B, self.torn.spread, self.torn.f
-        v = self.torn.apply("inverse", f - B.T @ s.x) - self.R @ s.y
+        v = self.torn.apply("inverse", f - B.T @ s.x) - self.torn.moved(s.y)
         copies = np.bincount(self.torn.component, minlength=T.shape[1])
         return np.asarray((T.T @ v) / copies)
 

@@ -235,8 +235,23 @@ class TornBodies:
 
     def kernel(self) -> csr_array:
         """Return R = diag(R_1 … R_S) (N, r), the rigid motions of all subdomains."""
-        R_of = {k: R for own in self.parts("modes") for k, R in own.items()}
+        R_of = self._modes()
         return block_diagonal([R_of[k] for k in self.domains.class_of.tolist()])
+
+    def moved(self, alpha: Vector) -> Vector:
+        """Return Rα (N,), without forming R, which is large."""
+        domains, R_of = self.domains, self._modes()
+        modes = np.array([R_of[k].shape[1] for k in range(domains.sizes.size)])
+        first = np.cumsum(modes[domains.class_of]) - modes[domains.class_of]
+        v = np.empty(domains.start[-1])
+        for k, members in domains.members:
+            place = domains.start[members] + np.arange(domains.sizes[k])[:, None]
+            v[place] = R_of[k] @ alpha[first[members] + np.arange(modes[k])[:, None]]
+        return v
+
+    def _modes(self) -> dict[int, Dense]:
+        """Return the rigid motions of each class."""
+        return {k: R for own in self.parts("modes") for k, R in own.items()}
 
     @property
     def rotation(self) -> NDArray[np.float64]:
