@@ -144,10 +144,10 @@ class Subdivision:
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
         """Count, for each node, the preceding nodes of equal multiplicity, (k,)."""
-        return np.asarray(self._before[node])
+        return np.asarray(self._before[node], dtype=np.int64)
 
     @cached_property
-    def _before(self) -> NDArray[np.int64]:
+    def _before(self) -> NDArray[np.int32]:
         multiplicity = np.diff(self._copies.indptr)
         before = np.empty(self.nodes, dtype=np.int32)
         for m in np.unique(multiplicity):
