@@ -37,6 +37,7 @@ AXES = {
     "error": "relative error",
     "residual": "largest relative residual",
     "memory": "peak memory in MiB",
+    "ratio": "time relative to a cold start",
 }
 
 

@@ -56,17 +56,6 @@ def test_a_solver_that_solved_few_problems_has_no_tier(rng):
     assert tiers(few + timed(rng, "all", 8, 3)) == {"all": 1, "few": 0}
 
 
-def test_the_loosest_tolerance_with_a_verified_answer_counts(rng):
-    loose = timed(rng, "a", 6, 3, seconds=0.01, tol=1e-4)
-    tight = timed(rng, "a", 6, 3, seconds=1.0, tol=1e-8)
-    wrong = [
-        r.replace(status=Verdict.INACCURATE)
-        for r in timed(rng, "b", 6, 3, 0.001, tol=1e-4)
-    ]
-    right = timed(rng, "b", 6, 3, seconds=0.1, tol=1e-8)
-    assert tiers(loose + tight + wrong + right) == {"a": 1, "b": 2}
-
-
 def test_warm_starts_that_save_and_cost_time_are_named(rng):
     """Planted: warm starts halve the time of load steps, and double that of jumps."""
     steps, records = [], []
