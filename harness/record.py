@@ -137,8 +137,6 @@ class Record(Struct, frozen=True, kw_only=True):
     solve_seconds: Annotated[_Seconds, _is("solve, s")] = None
     total_seconds: Annotated[_Seconds, _is("prepare + solve, s")] = None
     peak_mib: Annotated[_Size, _is("peak resident memory of the worker, MiB")] = None
-    prepare_peak_mib: Annotated[_Size, _is("the same in the preparation, MiB")] = None
-    solve_peak_mib: Annotated[_Size, _is("the same in the solve, MiB")] = None
     inner: Annotated[_Count, _is("timed solves, over which times are means")] = 1
     untimed: Annotated[_Count, _is("solves before and between the timed ones")] = 0
     remembered: Annotated[bool | None, _is("the solver reuses earlier answers")] = None

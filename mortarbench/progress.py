@@ -1,8 +1,8 @@
 """Displays of the progress of a run.
 
-A run reports its progress to a `Progress` (see `harness.running.progress`). The classes
-of this module implement `Progress`: they show a bar on a terminal or in a notebook,
-print one line per measurement elsewhere, or call a function of the user.
+A run reports its progress to a `Progress` (see `harness.running.progress`). `Display`
+turns each report into an `Event`, for a function of the user, or for a function of this
+module: a bar on a terminal or in a notebook, or one line per measurement elsewhere.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from html import escape
 from threading import Event as Signal
@@ -37,6 +37,7 @@ class Event:
     done: int
     total: int  #: largest possible number of measurements of the run
     now: str = ""  #: current activity
+    left: str = ""  #: remaining time, such as "0:02:30 left"; empty if it is unknown
     warning: str = ""  #: warning that caused this event; empty if there is no warning
     record: Record | None = None  #: measurement that was just completed, or None
 
@@ -44,82 +45,68 @@ class Event:
 Callback = Callable[[Event], object]
 
 
-class _Silent:
-    """Counters of completed measurements, which subclasses display."""
-
-    def __init__(self) -> None:
-        self.done = self.total = 0
-        self.measured = 0  # number of measurements of this run, unlike `done`
-        self.began = monotonic()
-        self.now = ""
-
-    def start(self, total: int) -> None:
-        self.total, self.began = total, monotonic()
-        self.changed()
-
-    def say(self, text: str) -> None:
-        self.now = text
-        self.changed()
-
-    def warn(self, text: str) -> None:
-        """Show a warning in a line that is not overwritten."""
-
-    def advance(self, record: Record | None) -> None:
-        self.done += 1
-        self.measured += record is not None
-        self.changed(record)
-
-    def left(self) -> str:
-        """Return the estimated remaining time; empty before the first measurement."""
-        seconds = monotonic() - self.began
-        return remaining(self.measured, self.total - self.done, seconds)
-
-    def changed(self, record: Record | None = None) -> None:
-        """Update the display; `record` is the measurement that was just completed."""
-
-
-class _Events(_Silent):
-    """Display that calls a function of the user at every change."""
+class Display:
+    """Progress of a run that calls a function at every change."""
 
     def __init__(self, callback: Callback) -> None:
-        super().__init__()
         self._callback = callback
-
-    def changed(self, record: Record | None = None) -> None:
-        self._callback(
-            Event(done=self.done, total=self.total, now=self.now, record=record)
-        )
-
-    def warn(self, text: str) -> None:
-        self._callback(
-            Event(done=self.done, total=self.total, now=self.now, warning=text)
-        )
-
-
-class Warnings(_Silent):
-    """Display that writes only warnings."""
-
-    def __init__(self, stream: TextIO) -> None:
-        super().__init__()
-        self._stream = stream
-
-    def warn(self, text: str) -> None:
-        """Write a warning."""
-        # The run must continue if the program that reads its output closes the pipe.
-        with suppress(BrokenPipeError):
-            print(text, file=self._stream, flush=True)
-
-
-class _Lines(Warnings):
-    """Display that writes one line per measurement."""
+        self._done = self._total = 0
+        self._measured = 0  # number of measurements of this run, unlike `_done`
+        self._began = monotonic()
+        self._now = ""
 
     def start(self, total: int) -> None:
-        super().start(total)
-        self.warn(f"{total} measurement{'s' * (total != 1)}")
+        """Begin a run of `total` cells."""
+        self._total, self._began = total, monotonic()
+        self._call()
 
-    def changed(self, record: Record | None = None) -> None:
-        if record is not None:
-            self.warn(f"{self.done}/{self.total} {_line(record)}")
+    def say(self, text: str) -> None:
+        """Change the current activity."""
+        self._now = text
+        self._call()
+
+    def warn(self, text: str) -> None:
+        """Pass on a warning."""
+        self._call(warning=text)
+
+    def advance(self, record: Record | None) -> None:
+        """Count a cell as done."""
+        self._done += 1
+        self._measured += record is not None
+        self._call(record=record)
+
+    def _call(self, **more: Any) -> None:
+        seconds, to_do = monotonic() - self._began, self._total - self._done
+        left = ""
+        if self._measured and to_do > 0:
+            left = f"{timedelta(seconds=round(seconds / self._measured * to_do))} left"
+        state = Event(done=self._done, total=self._total, now=self._now, left=left)
+        self._callback(replace(state, **more))
+
+
+def warnings_on(stream: TextIO) -> Callback:
+    """Return a function that writes only warnings."""
+
+    def show(event: Event) -> None:
+        if event.warning:
+            # the run must continue if the program that reads its output closes the pipe
+            with suppress(BrokenPipeError):
+                print(event.warning, file=stream, flush=True)
+
+    return show
+
+
+def lines_on(stream: TextIO) -> Callback:
+    """Return a function that writes warnings, and one line per measurement."""
+    write = warnings_on(stream)
+
+    def show(event: Event) -> None:
+        if event.record is not None:
+            line = f"{event.done}/{event.total} {_line(event.record)}"
+            event = replace(event, warning=line)
+        write(event)
+
+    return show
 
 
 def _line(record: Record) -> str:
@@ -131,139 +118,99 @@ def _line(record: Record) -> str:
     return f"{record.solver} on {record.case}: {record.status.words}{detail}"
 
 
-class _Bar(_Silent):
-    """Bar with a list of the measurements that are neither verified nor declined."""
-
-    def changed(self, record: Record | None = None) -> None:
-        if record is None or record.status.is_verified:
-            return
-        if record.status is not Verdict.DECLINED:
-            self.warn(_line(record))
+def _remark(event: Event) -> str:
+    """Return a warning, or a line on a result that is neither verified nor declined."""
+    r = event.record
+    if r is None or r.status.is_verified or r.status is Verdict.DECLINED:
+        return event.warning
+    return _line(r)
 
 
-class _Terminal(_Bar):
-    """Bar of `rich` on a terminal."""
-
-    def __init__(self, bar: Any) -> None:
-        super().__init__()
-        self._bar = bar
-        self._task = bar.add_task("starting", total=None, left=self.left)
-
-    def warn(self, text: str) -> None:
-        self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-    def changed(self, record: Record | None = None) -> None:
-        from rich.markup import escape
-
-        state = {"total": self.total or None, "completed": self.done}
-        self._bar.update(self._task, description=escape(self.now), **state)
-        super().changed(record)
-
-
-class _Notebook(_Bar):
-    """Bar in a notebook."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        from IPython.display import HTML, display
-
-        self._html = HTML
-        self._updated = -_UPDATE_SECONDS
-        self._handle = display(HTML(""), display_id=True)
-
-    def warn(self, text: str) -> None:
-        print(text)
-
-    def changed(self, record: Record | None = None) -> None:
-        super().changed(record)
-        if monotonic() - self._updated < _UPDATE_SECONDS and self.done < self.total:
-            return
-        self._updated = monotonic()
-        bar = f"<progress value='{self.done}' max='{self.total or 1}'></progress>"
-        text = escape(f"{self.done}/{self.total} {self.left()} {self.now}")
-        self._handle.update(self._html(f"{bar} {text}"))
-
-
-def remaining(measured: int, to_do: int, seconds: float) -> str:
-    """Return the remaining time at the present rate, as "H:MM:SS left"; "" if unknown.
-
-    measured : number of measurements of this run, which took `seconds`
-    to_do : number of remaining measurements
-    """
-    if measured <= 0 or to_do <= 0:
-        return ""
-    left = timedelta(seconds=round(seconds / measured * to_do))
-    return f"{left} left"
-
-
-def in_notebook() -> bool:
+def _in_notebook() -> bool:
     """Return True if this process is the kernel of a notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return shell is not None and "IPKernelApp" in getattr(shell, "config", {})
+
+
+def _notebook() -> Callback:
+    """Return a function that updates a bar in a notebook, and prints remarks."""
+    from IPython.display import HTML, display
+
+    handle, updated = display(HTML(""), display_id=True), [-_UPDATE_SECONDS]
+
+    def show(event: Event) -> None:
+        if remark := _remark(event):
+            print(remark)
+        if monotonic() - updated[0] >= _UPDATE_SECONDS or event.done >= event.total:
+            updated[0] = monotonic()
+            bar = f"<progress value='{event.done}' max='{event.total or 1}'></progress>"
+            text = escape(f"{event.done}/{event.total} {event.left} {event.now}")
+            handle.update(HTML(f"{bar} {text}"))
+
+    return show
 
 
 @contextmanager
 def display_on(stream: TextIO) -> Iterator[Progress]:
     """Show progress on a stream: a bar on a terminal, else one line per measurement."""
     if not stream.isatty():
-        yield _Lines(stream)
+        yield Display(lines_on(stream))
         return
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        ProgressColumn,
-        Task,
-        TextColumn,
-    )
+    from rich.markup import escape as literal
+    from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn
     from rich.progress import Progress as Bars
     from rich.table import Column
-    from rich.text import Text
 
-    class TimeLeft(ProgressColumn):
-        """Remaining time, estimated from all measurements of the run.
+    def column(**settings: Any) -> Column:
+        return Column(no_wrap=True, **settings)
 
-        The corresponding column of rich uses only the last 30 s, in which possibly no
-        measurement has been completed.
-        """
-
-        def render(self, task: Task) -> Text:
-            return Text(task.fields["left"](), style="progress.remaining")
-
-    now = Column(no_wrap=True, overflow="ellipsis", ratio=1)
     columns: list[ProgressColumn] = [
-        MofNCompleteColumn(table_column=Column(no_wrap=True)),
-        TimeLeft(table_column=Column(no_wrap=True)),
-        TextColumn("{task.description}", table_column=now),
+        MofNCompleteColumn(table_column=column()),
+        TextColumn("{task.fields[left]}", table_column=column()),
+        TextColumn(
+            "{task.description}", table_column=column(overflow="ellipsis", ratio=1)
+        ),
     ]
     console = Console(file=stream)
     if console.width >= _BAR_WIDTH:
         columns.insert(0, BarColumn(bar_width=20))
     with Bars(*columns, console=console, expand=True) as bar:
-        yield _Terminal(bar)
+        task = bar.add_task("starting", total=None, left="")
+
+        def show(event: Event) -> None:
+            bar.update(
+                task,
+                description=literal(event.now),
+                total=event.total or None,
+                completed=event.done,
+                left=event.left,
+            )
+            if remark := _remark(event):
+                console.print(remark, markup=False, highlight=False, soft_wrap=True)
+
+        yield Display(show)
 
 
 @contextmanager
-def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
+def shown(progress: bool | Callback | None) -> Iterator[Progress]:
     """Provide the display for the argument `progress` of `mortarbench.run`."""
-    if progress in (True, None) and in_notebook():
-        yield _Notebook()
+    if progress in (True, None) and _in_notebook():
+        yield Display(_notebook())
     elif progress is True:
         with display_on(sys.stderr) as bar:
             yield bar
-    elif isinstance(progress, Progress):
-        yield progress
     elif callable(progress):
-        yield _Events(progress)
+        yield Display(progress)
     elif progress in (None, False):
-        yield _Silent()
+        yield Display(ignore)
     else:
         raise InputError(
             f"progress = {repeated(progress)}; expected True, False, None or a function"
         )
 
 
-def ignore(text: str) -> None:
+def ignore(_: object) -> None:
     """Discard a message."""
 
 

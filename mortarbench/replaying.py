@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,15 +12,18 @@ from msgspec import structs
 from mortarbench.answer import solve
 from mortarbench.case import Case
 from mortarbench.harness import checked
-from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import InputError, shortened
 from mortarbench.harness.record import Record, finite
 from mortarbench.harness.registry import SolverSpec, options_of, resolve
 from mortarbench.registries import TURN, Plugins, Registries, load_registries
 from mortarbench.text import align
 
-_RESIDUALS = ("primal", "dual", "complementarity", "gap")
-_SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
-_VALUE_LENGTH = 48  #: maximum displayed length of a value of the environment
+#: fields of records that are compared
+_COMPARED = (
+    "status", "claimed", "message", "qp", "iterations", "options", "counts", "primal",
+    "dual", "complementarity", "gap", "objective", "prepare_seconds", "solve_seconds",
+)  # fmt: skip
+_VALUE_LENGTH = 48  #: maximum displayed length of a value
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -44,20 +47,21 @@ class Replay:
 
     def __repr__(self) -> str:
         """Return a table of old and new values, and a conclusion."""
-        r = self.now
-        rows = [["", "then", "now", ""], *_rows(self.then, r)]
-        lines = [f"{r.run_id}  {r.solver} on {r.case}, tolerance {r.tol:g}", ""]
-        lines += [align(rows), ""]
-        if self.environment:
-            shown = [
-                [f"  {k}", _text(a), f"→ {_text(b)}"] for k, a, b in self.environment
-            ]
-            lines += ["The environment differs:", align(shown), ""]
-        if self.reproduced:
-            return "\n".join([*lines, "Reproduced: the same verdict."])
-        why = f"{self.then.status} then, {self.now.status} now"
-        why = why if self.same_qp else "the case now has a different QP"
-        return "\n".join([*lines, f"Not reproduced: {why}."])
+        r, rows = self.now, [["", "then", "now", ""]]
+        for name in _COMPARED:
+            a, b = getattr(self.then, name), getattr(r, name)
+            same = "same" if a == b else "differs"
+            if not (a is b is None or a == b == ""):
+                remark = "" if name.endswith("seconds") else same
+                rows.append([name, _text(a), _text(b), remark])
+        rows += [[k, _text(a), _text(b), "differs"] for k, a, b in self.environment]
+        end = "Reproduced: the same verdict."
+        if not self.same_qp:
+            end = "Not reproduced: the case now has a different QP."
+        elif not self.reproduced:
+            end = f"Not reproduced: {self.then.status} then, {r.status} now."
+        head = f"{r.run_id}  {r.solver} on {r.case}, tolerance {r.tol:g}"
+        return f"{head}\n\n{align(rows)}\n\n{end}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as plain data for JSON."""
@@ -161,28 +165,6 @@ def _changed_options(r: Record, registries: Registries) -> Mapping[str, Any]:
     }
 
 
-def _rows(then: Record, now: Record) -> Iterable[list[str]]:
-    """Yield the name, both values and a remark for each field that is not None."""
-    for name in ("status", "claimed", "message", "qp", "iterations"):
-        a, b = getattr(then, name), getattr(now, name)
-        if a or b:
-            yield [name, _text(a), _text(b), _same(a == b)]
-    yield ["options", "", "", _same(then.options == now.options)]
-    for name in sorted({*then.counts, *now.counts}):
-        a, b = then.counts.get(name), now.counts.get(name)
-        yield [name, _text(a), _text(b), _same(a == b)]
-    for name in (*_RESIDUALS, "objective", *_SECONDS):
-        a, b = getattr(then, name), getattr(now, name)
-        digits = ".10g" if name == "objective" else ".3g"
-        same = "" if name in _SECONDS else _same(a == b)
-        if (a, b) != (None, None):
-            yield [name, *("–" if v is None else f"{v:{digits}}" for v in (a, b)), same]
-
-
-def _same(yes: bool) -> str:
-    return "same" if yes else "differs"
-
-
 def _text(value: Any) -> str:
-    text = "–" if value is None else str(value)
-    return text if len(text) <= _VALUE_LENGTH else text[: _VALUE_LENGTH - 1] + "…"
+    text = f"{value:.10g}" if isinstance(value, float) else str(value)
+    return "–" if value is None else shortened(text, _VALUE_LENGTH)

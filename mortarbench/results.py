@@ -23,7 +23,6 @@ from mortarbench.harness.record import REFUTED, Record, Verdict
 from mortarbench.harness.registry import is_solver, resolve
 from mortarbench.harness.results.folder import keep_environment, refuse_links
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.suite.solver_options import listed_options, selected, sweep
 from mortarbench.harness.suite.suite import as_toml, expanded, read_suite, suite_file
 from mortarbench.progress import Callback, ignore, shown
@@ -291,7 +290,7 @@ def run(
     fresh: bool = False,
     dask: Annotated[str | None, "ADDRESS|local"] = None,
     plugins: Plugins = (),
-    progress: bool | Callback | Progress | None = None,
+    progress: bool | Callback | None = None,
     registries: Registries | None = None,
 ) -> Results:
     """Measure a suite and store the results in a folder; existing results are kept.

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from mortarbench.harness.record import Record
 
 
-@runtime_checkable
 class Progress(Protocol):
     """Progress callbacks.
 

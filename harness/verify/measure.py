@@ -112,12 +112,14 @@ def measure(
     """
     run = _Run(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
+        reset = reset_peak()
         starts()
         try:  # only solver code may run here: bugs of the harness must be raised
             try:
-                answer, seconds, peaks = run(qp, peaks=True)
+                answer, seconds = run(qp)
             finally:
                 solved()
+            peak = memory_mib("VmHWM") if reset else None
             repeats, remembered, untimed = [seconds], None, 0
             if not (once or prepare or sum(seconds) > MAX_UNTIMED_SECONDS):
                 rest = _Perturbed(run, qp, answer)
@@ -135,9 +137,7 @@ def measure(
         "prepare_seconds": means[0],
         "solve_seconds": means[1],
         "total_seconds": sum(means),
-        "peak_mib": max((p for p in peaks if p is not None), default=None),
-        "prepare_peak_mib": peaks[0],
-        "solve_peak_mib": peaks[1],
+        "peak_mib": peak,
         "inner": len(repeats),
         "untimed": untimed,
         "remembered": remembered,
@@ -162,7 +162,7 @@ def solve_once(
     """
     run = _Run(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
-        answer, seconds, _ = run(qp)
+        answer, seconds = run(qp)
     s = _checked(answer, qp)
     if s.status is Status.DECLINED:
         raise DeclinedError(s.message)
@@ -186,27 +186,16 @@ class _Run:
         self.solves = 0
         self.worked_seconds = 0.0
 
-    def __call__(
-        self, qp: QP, *, peaks: bool = False
-    ) -> tuple[object, tuple[float, float], tuple[float | None, float | None]]:
-        """Prepare and solve once.
-
-        Returns the answer, the times of preparation and solve (s), and the memory peaks
-        of preparation and solve (MiB; None if not measured).
-        """
+    def __call__(self, qp: QP) -> tuple[object, tuple[float, float]]:
+        """Prepare and solve once; return the answer, and the times of both (s)."""
         process, self.solves = os.getpid(), self.solves + 1
         entered = perf_counter()
         try:
-            reset = peaks and reset_peak()
             start = perf_counter()
             solve = self._prepared(qp)
             ready = perf_counter()
-            prepare_peak = memory_mib("VmHWM") if reset else None
-            reset = peaks and reset_peak()
-            resumed = perf_counter()
             answer = solve()
             end = perf_counter()
-            solve_peak = memory_mib("VmHWM") if reset else None
         except (DeclinedError, SolverError):
             raise
         except ImportError as e:
@@ -222,7 +211,7 @@ class _Run:
             self.worked_seconds += perf_counter() - entered
         if hasattr(qp.P, "forget"):
             qp.P.forget()
-        return answer, (ready - start, end - resumed), (prepare_peak, solve_peak)
+        return answer, (ready - start, end - ready)
 
     def _prepared(self, qp: QP) -> Callable[[], Solution]:
         """Call `declines`, assemble P if the solver needs its entries, and prepare."""
@@ -268,7 +257,7 @@ class _Perturbed:
             self._run.worked_seconds += perf_counter() - start
             if other is None:
                 return
-            answer, seconds, _ = self._run(other)
+            answer, seconds = self._run(other)
         except (DeclinedError, SolverError, MemoryError):
             return
         s = _checked(answer, other)
@@ -309,7 +298,7 @@ def _repeated(
     while not repeats or (total < SAMPLE_SECONDS and len(repeats) < MAX_INNER_LOOPS):
         if rest.total_seconds < MAX_PERTURBED_SECONDS:
             rest.solve()
-        answer, seconds, _ = run(_fresh_copy(qp))
+        answer, seconds = run(_fresh_copy(qp))
         repeats.append(seconds)
         total += sum(seconds)
     return answer, repeats

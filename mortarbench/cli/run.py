@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import mortarbench as mb
 from mortarbench.harness.errors import some
 from mortarbench.harness.suite.solver_options import parse_options
-from mortarbench.progress import Warnings
+from mortarbench.progress import warnings_on
 from mortarbench.registries import Registries
 
 
@@ -37,7 +37,7 @@ def run(
     measured = mb.run(
         **arguments,
         options=parse_options(option),
-        progress=Warnings(sys.stderr) if quiet else True,
+        progress=warnings_on(sys.stderr) if quiet else True,
         registries=registries,
     )
     if not json and not quiet:

@@ -209,7 +209,7 @@ def test_an_interrupted_run_prints_how_to_continue(cli, monkeypatch):
     code, out, err = cli("run", "tiny")
 
     assert (code, out) == (130, "")
-    assert err.endswith("\nmortarbench: interrupted; the same command continues\n")
+    assert err.endswith("mortarbench: interrupted; the same command continues\n")
 
 
 def test_output_of_a_solver_is_not_mixed_with_results(cli):

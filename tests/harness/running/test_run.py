@@ -211,8 +211,7 @@ def test_a_record_contains_times_of_phases_threads_and_cpu(measure, tmp_path):
     assert quick.total_seconds < 0.001
     assert min(quick.build_seconds, quick.recover_seconds) > 0
     assert quick.dualise_seconds is None
-    peaks = (quick.prepare_peak_mib, quick.solve_peak_mib)
-    assert quick.peak_mib == max(peaks) > 10
+    assert quick.peak_mib > 10
 
 
 def three_steps(*solvers, cases=(), **changes):
