@@ -127,15 +127,6 @@ def report_folder(
     return write_report(folder, formats, factor)
 
 
-ValidationPage: TypeAlias = Callable[[Path, Mapping[str, Any]], list[Path]]
-
-
-def _validation_page(folder: Path, data: Mapping[str, Any]) -> list[Path]:
-    from mortarbench.reports.validation import write_validation
-
-    return write_validation(folder, data)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Registries:
     """Families, solvers and operators, and the commands that start processes."""
@@ -144,7 +135,6 @@ class Registries:
     solvers: Mapping[str, Solver] = field(default_factory=lambda: SOLVERS)
     reference: Reference = reference
     report: Reporter = report_folder
-    validation_page: ValidationPage = _validation_page
     #: functions that construct an operator P, see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
     #: operators that do not come from plug-in files

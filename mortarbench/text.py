@@ -334,9 +334,3 @@ def _text(value: Any, unit: str = "", digits: int = 9) -> str:
         case _:
             text = str(value)
     return f"{text} {unit}".rstrip()
-
-
-def printable(text: str) -> str:
-    """Join the lines of a text, and replace its unprintable characters."""
-    line = " ".join(text.split())
-    return "".join(c if c.isprintable() else "\ufffd" for c in line)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from math import inf
@@ -18,17 +18,15 @@ from mortarbench.harness.plugin import Solver
 from mortarbench.harness.registry import SolverSpec, check_solver, resolve
 from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, load_registries, one_thread
-from mortarbench.text import align, printable
+from mortarbench.text import align
 
 if TYPE_CHECKING:
     from mortarbench.harness.conformance.conformance import Result
-    from mortarbench.harness.crossval.comparison import Outcome
     from mortarbench.harness.processes.supervisor import WorkerProcess
 
 TIME_LIMIT = 10.0  #: time limit for each check of the conformance suite, in s
 MEMORY_LIMIT = 4096.0  #: memory limit for each check, in MiB
-#: largest number of entries in a list on the terminal; the page lists all entries
-_MAX_ENTRIES = 12
+_MAX_ROWS = 12  #: largest number of rows of a table on the terminal
 _EQUAL_FAILURES = 3  #: smallest number of checks with equal failures that are one line
 
 
@@ -45,7 +43,22 @@ class Validation:
         return dict(self.data)
 
     def __repr__(self) -> str:
-        return as_text(self.data)
+        """Return the page without its rules, and with the first rows of each table."""
+        from mortarbench.reports.document import Table
+        from mortarbench.reports.validation import compose
+
+        parts: list[str] = []
+        for section in compose(self.data).sections[:-1]:
+            for item in section.items:
+                if isinstance(item, Table):
+                    rows = [item.head, *item.rows[:_MAX_ROWS]]
+                    table = align(rows, right=range(item.texts, len(item.head)))
+                    more = len(item.rows) - _MAX_ROWS
+                    parts.append(f"{section.title}\n{table}")
+                    parts += [f"… and {more} more, see the page"] * (more > 0)
+                elif isinstance(item, str):
+                    parts.append(item)
+        return "\n\n".join(parts)
 
 
 def validate(
@@ -88,6 +101,7 @@ def validate(
     registries = load_registries(plugins, registries)
     from mortarbench.harness.crossval.summary import as_data
     from mortarbench.harness.crossval.validation import validate_folder
+    from mortarbench.reports.validation import write_validation
 
     families, reference = registries.families, registries.reference
     with one_thread():
@@ -96,70 +110,8 @@ def validate(
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
         replace_file(path / "validation.json", text.encode())
-    pages = tuple(registries.validation_page(path, data))
+    pages = tuple(write_validation(path, data))
     return Validation(agreed=data["agreed"], data=data, pages=pages)
-
-
-def as_text(data: Mapping[str, Any]) -> str:
-    """Return the data of `harness.crossval.summary.as_data` as text for a terminal."""
-    from mortarbench.harness.crossval.comparison import Outcome
-
-    parts = [printable(data["headline"]), _solvers(data["solvers"])]
-    for title, outcome in (
-        ("Refuted claims", Outcome.REFUTED),
-        ("Certificates contradicted (an error of this program)", Outcome.CONTRADICTED),
-        ("Not validated", Outcome.NOT_VALIDATED),
-    ):
-        if lines := _listed(data["answers"], outcome):
-            parts.append("\n".join([f"{title}:", *lines]))
-    if unanswered := data["counts"]["unanswered"]:
-        parts.append(f"{unanswered} measurements ended without a claim of success.")
-    return "\n\n".join(parts)
-
-
-def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the table of certified errors, one row for each solver and tolerance."""
-    columns = {
-        "error_median": "error: median",
-        "error_worst": "worst",
-        "primal_dual": "primal-dual",
-    }
-    head = ["solver", "tol", "answers", "refuted", "unanswered", *columns.values()]
-    lines = [
-        [
-            printable(row["solver"]),
-            f"{row['tol']:g}",
-            *(str(row[key]) for key in ("answers", "refuted", "unanswered")),
-            *(_e(row[key]) for key in columns),
-        ]
-        for row in rows
-    ]
-    table = align([head, *lines], right=range(1, len(head)))
-    return (
-        "Certified relative errors of the solvers in the energy norm, without "
-        f"discretisation errors.\n{table}"
-    )
-
-
-def _listed(answers: Sequence[Mapping[str, Any]], outcome: Outcome) -> list[str]:
-    """Return a line for each solver and reason with this outcome, worst error first."""
-    chosen = [a for a in answers if a["outcome"] == outcome]
-    chosen.sort(key=lambda a: -(a["bound"] or 0.0))
-    counted = Counter((a["solver"], a["case"], a["text"]) for a in chosen)
-    lines = [
-        f"  {printable(f'{solver} on {case}: {text}')}" + f" ({n} answers)" * (n > 1)
-        for (solver, case, text), n in counted.items()
-    ]
-    more = len(lines) - _MAX_ENTRIES
-    return lines[:_MAX_ENTRIES] + [f"  … and {more} more, see the page"] * (more > 0)
-
-
-def _e(value: float | None) -> str:
-    from mortarbench.harness.crossval.comparison import brief
-
-    if value is None:
-        return "-"
-    return brief(value) if value else "0"
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

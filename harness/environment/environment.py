@@ -56,6 +56,7 @@ def capture(
     plugins : plug-in files; digests of their code are included
     packages : packages of solvers whose versions are included
     """
+    import psutil
     from threadpoolctl import threadpool_info
 
     # import these modules, since threadpoolctl finds only loaded libraries
@@ -69,16 +70,16 @@ def capture(
     )
     maps = _read(Path("/proc/self/maps"))
     cholmod = re.search(r"/libcholmod[^/]*\.so\.([\d.]+)$", maps, re.M)
-    cores = set(zip(_cpuinfo("physical id"), _cpuinfo("core id"), strict=False))
+    memory = psutil.virtual_memory()
     governors = {_read(f) for f in _CPU.glob("cpu[0-9]*/cpufreq/scaling_governor")}
     return {
         "machine": {
             "cpu": next(iter(_cpuinfo("model name")), None),
-            "physical_cores": len(cores) or None,
+            "physical_cores": psutil.cpu_count(logical=False),
             "logical_cores": os.cpu_count(),
             "usable_cores": len(os.sched_getaffinity(0)),
             "cpu_limit": _cpu_limit(),
-            "memory_mib": _meminfo("MemTotal"),
+            "memory_mib": memory.total >> 20,
             "architecture": platform.machine(),
             "system": platform.system(),
             "kernel": platform.release(),
@@ -105,7 +106,7 @@ def capture(
         "now": {
             "time": datetime.now(UTC).isoformat(timespec="seconds"),
             "load": os.getloadavg()[0],
-            "available_memory_mib": _meminfo("MemAvailable"),
+            "available_memory_mib": memory.available >> 20,
         },
     }
 
@@ -249,12 +250,6 @@ def _turbo() -> bool | None:
         return no_turbo == "0"
     boost = _read(_CPU / "cpufreq/boost")
     return boost == "1" if boost else None
-
-
-def _meminfo(key: str) -> int | None:
-    """Return the value of an entry of /proc/meminfo in MiB; None if it is missing."""
-    entry = re.search(rf"^{key}:\s+(\d+) kB", _read(Path("/proc/meminfo")), re.M)
-    return int(entry[1]) // 1024 if entry else None
 
 
 def _cpuinfo(key: str) -> list[str]:

@@ -264,9 +264,7 @@ def test_a_case_built_in_many_threads_is_the_one_that_was_measured(smoke):
     """With a different digest, no stored answer could be verified."""
     program = (
         "import mortarbench as mb\n"
-        "from mortarbench.registries import Registries\n"
-        "without_page = Registries(validation_page=lambda *_: [])\n"
-        "checked = mb.validate('.', registries=without_page)\n"
+        "checked = mb.validate('.')\n"
         "print(checked.data['counts']['answers'], checked.agreed)\n"
     )
 

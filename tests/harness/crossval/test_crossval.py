@@ -24,7 +24,6 @@ from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.verify.verdicts import judged, new_record
 from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from mortarbench.reports.validation import write_validation
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import FALSE_CLAIMS
 from tests.support.stored import save_solution
@@ -35,7 +34,6 @@ PLUGIN = load_plugin(FALSE_CLAIMS)
 FAMILIES = {**PROBLEMS, **PLUGIN.problems}
 BEAM = "beam-ring/Nr=2/Nh=1/steps=2"
 HONEST = ("a", "b", "c", "d")
-NOWHERE = {"report": None, "validation_page": lambda *_: []}
 
 
 def built(text, families=FAMILIES):
@@ -72,11 +70,10 @@ def write(folder, answers, tol=1e-8):
 def cli(capsys):
     """Validate a folder; return the exit code, stdout and stderr."""
 
-    def cli(*argv, **more):
+    def cli(*argv):
         registries = Registries(
-            families=PROBLEMS, solvers={}, reference=reference_solution,
-            **(NOWHERE | more),
-        )  # fmt: skip
+            families=PROBLEMS, solvers={}, reference=reference_solution
+        )
         code = main(registries, ["validate", *map(str, argv)])
         return code, *capsys.readouterr()
 
@@ -154,7 +151,7 @@ def test_answers_of_all_forms_that_are_exact_agree(truths, tmp_path, cli):
         for label in ("a", "smalbe")
     ]
 
-    code, out, err = cli(write(tmp_path, answers), validation_page=write_validation)
+    code, out, err = cli(write(tmp_path, answers))
 
     assert code == 0
     assert out.startswith("No disagreement: 12 answers of 2 solvers to 6 cases")
@@ -415,7 +412,7 @@ def test_hostile_names_and_huge_numbers_do_not_break_page_or_terminal(
     huge = replace(s, x=np.full_like(s.x, 1e300))
     answers = [("a", f"{BEAM}/primal", s), (name, f"{BEAM}/primal", huge)]
 
-    code, out, _ = cli(write(tmp_path, answers), validation_page=write_validation)
+    code, out, _ = cli(write(tmp_path, answers))
 
     def refuse(constant):
         raise AssertionError(constant)
