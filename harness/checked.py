@@ -16,8 +16,6 @@ from typing import Any
 
 from mortarbench.harness.errors import InputError, shown, unknown
 
-MAX_COUNT = 1_000_000  #: default upper limit in `at_least_one`
-
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
@@ -33,17 +31,6 @@ def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
     for key in table:
         if key not in known:
             raise unknown("key", key, known)
-
-
-def at_least_one(where: str, value: object, most: int = MAX_COUNT) -> int:
-    """Check that `value` is an int from 1 to `most`, and not a bool; return it."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise InputError(f"{where} = {shown(value)}; expected an integer of at least 1")
-    if value > most:
-        raise InputError(
-            f"{where} = {shown(value)}; expected an integer of at most {most}"
-        )
-    return value
 
 
 def positive(where: str, value: Any) -> float:

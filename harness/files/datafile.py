@@ -1,11 +1,4 @@
-"""Reading of data files from untrusted sources, within a memory limit.
-
-A small file can declare huge data, for instance an archive that expands a thousandfold,
-or a matrix with a billion columns and no entries. Readers therefore compute the
-required memory from the headers. If the required memory exceeds the limit, readers
-refuse the file before they read the data. The environment variable
-``MORTARBENCH_MOST_MIB`` sets the limit in MiB; the default is 2048.
-"""
+"""Reading of data files from untrusted sources, within the limit of `reading`."""
 
 from __future__ import annotations
 
@@ -18,62 +11,19 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files import reading
-from mortarbench.harness.limits import limit_of
-
-VARIABLE = "MORTARBENCH_MOST_MIB"
-DEFAULT_MIB = 2048
-MIB = 2**20  #: number of bytes in a mebibyte
+from mortarbench.harness.files.reading import (
+    MIB,
+    VARIABLE,
+    check_size,
+    max_bytes,
+    opened,
+)
 
 _PARSER_BYTES = 256 * MIB  #: memory that a parser may use in addition to the data
-
-
-def max_bytes() -> int:
-    """Return the memory limit for a data file, in bytes; see `limit_of` for errors."""
-    return int(limit_of(VARIABLE, DEFAULT_MIB) * MIB)
-
-
-def check_size(what: str, size: int) -> None:
-    """Check that data of `size` bytes do not exceed the memory limit.
-
-    what : subject of the error message
-
-    Raises
-    ------
-    InputError
-        If the data exceed the limit; the message states the required memory in MiB, and
-        how to raise the limit.
-
-    """
-    if size > (most := max_bytes()):
-        # `//` rounds down, so a size just above the limit would be printed as the limit
-        needed = f"{max(size // MIB, most // MIB + 1)}"
-        needed = needed if size < 2**60 else "more than 10^12"
-        raise InputError(
-            f"{what} would take {needed} MiB of memory; expected at most {most // MIB} "
-            f"(set {VARIABLE} to allow more)"
-        )
-
-
-@contextmanager
-def opened(path: Path, expected: str) -> Iterator[BinaryIO]:
-    """Open a regular file for reading; pipes and devices are refused.
-
-    expected : description of the file, for messages, e.g. "an npz file"
-
-    Raises
-    ------
-    InputError
-        If the file cannot be opened, is not a regular file, or exceeds the limit.
-
-    """
-    with reading.opened(path, expected) as file:
-        check_size(f"{path}: the file", os.fstat(file.fileno()).st_size)
-        yield file
 
 
 def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
@@ -91,9 +41,9 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
 
     """
     with opened(path, expected) as file:
+        size = os.fstat(file.fileno()).st_size
+        check_size(f"{path}: its content", copies * size)
         if path.suffix.lower() != ".gz":
-            size = os.fstat(file.fileno()).st_size
-            check_size(f"{path}: its content", copies * size)
             return file.read(size)
         most = max_bytes() // copies
         try:

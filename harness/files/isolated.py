@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files import reader
-from mortarbench.harness.files.datafile import MIB, VARIABLE, max_bytes
 from mortarbench.harness.files.npz import arrays_in
+from mortarbench.harness.files.reading import MIB, VARIABLE, max_bytes
 
 
 def read_isolated(
@@ -30,7 +30,7 @@ def read_isolated(
     ------
     InputError
         If the file cannot be read, or its data exceed the limit of
-        `harness.files.datafile`.
+        `harness.files.reading`.
 
     """
     most = max_bytes()

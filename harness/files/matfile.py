@@ -62,7 +62,7 @@ def read_mat(path: Path) -> dict[str, NDArray[Any]]:
     ------
     InputError
         If the file cannot be read, is not a .mat file of MATLAB 4 to 7.2, or contains
-        more data than `harness.files.datafile` allows.
+        more data than `harness.files.reading` allows.
 
     """
     data = content(path, "a .mat file")

@@ -12,7 +12,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from mortarbench.harness.errors import InputError, shortened
-from mortarbench.harness.files.datafile import check_size, opened
+from mortarbench.harness.files.reading import check_size, opened
 
 EXPECTED = "an npz file"
 #: kinds of dtypes that are read; records and objects, which are pickled, are refused
@@ -25,7 +25,7 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        For the same reasons as in `harness.files.datafile.opened`, if the arrays would
+        For the same reasons as in `harness.files.reading.opened`, if the arrays would
         exceed the memory limit, or if an array is pickled.
     ValueError, BadZipFile
         If the file is not an npz file of plain arrays.

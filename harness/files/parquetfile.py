@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, issparse
 
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.datafile import json_object, opened
+from mortarbench.harness.files.datafile import json_object
 from mortarbench.harness.files.durable import writing
 from mortarbench.harness.files.isolated import read_isolated
 from mortarbench.harness.files.qpfile import (
@@ -39,6 +39,7 @@ from mortarbench.harness.files.qpfile import (
     malformed,
     qp_of,
 )
+from mortarbench.harness.files.reading import opened
 from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.sets.arrays import SET_ARRAY, set_arrays
 

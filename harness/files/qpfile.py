@@ -40,9 +40,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, issparse
 
 from mortarbench.harness.errors import InputError, shortened, unknown
-from mortarbench.harness.files.datafile import check_size, json_object
+from mortarbench.harness.files.datafile import json_object
 from mortarbench.harness.files.durable import writing
 from mortarbench.harness.files.mapped import read_mapped, write_mapped
+from mortarbench.harness.files.reading import check_size
 from mortarbench.harness.files.store import digest_of, read_arrays
 from mortarbench.harness.operators import Maker, SerialisableOperator, assembled
 from mortarbench.harness.qp import (
@@ -176,7 +177,7 @@ def load_qp(
 
     operators : makers of operators by name (`harness.operators`), for a file that
         `save_qp` has written with `serialised`. None for an npz file, whose size is
-        limited by `harness.files.datafile`
+        limited by `harness.files.reading`
 
     Raises
     ------
@@ -300,7 +301,7 @@ def check_dense(name: str, M: Matrix) -> None:
     Raises
     ------
     InputError
-        If the dense array would exceed the limit of `harness.files.datafile`.
+        If the dense array would exceed the limit of `harness.files.reading`.
 
     """
     check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))

@@ -1,7 +1,13 @@
-"""Reading of text files from untrusted sources, within limits.
+"""Reading of files from untrusted sources, within limits.
+
+A small file can declare huge data, for instance an archive that expands a thousandfold,
+or a matrix with a billion columns and no entries. Readers therefore compute the
+required memory from the headers. If the required memory exceeds the limit, readers
+refuse the file before they read the data. The environment variable
+``MORTARBENCH_MOST_MIB`` sets the limit in MiB; the default is 2048.
 
 A file must be regular, since a device or a pipe may never end. The file must also
-declare its size, which files in /proc do not. The content must be UTF-8, must not
+declare its size, which files in /proc do not. A text must be UTF-8, must not
 exceed a limit, and must not be nested too deeply. All functions raise an `InputError`
 that states where the error is and what was expected.
 """
@@ -22,6 +28,7 @@ import msgspec
 
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import FULL
+from mortarbench.harness.limits import limit_of
 
 MAX_TOML_MIB = 1  #: limit for TOML files; a file of this size takes 1 s to parse
 MAX_JSON_MIB = 64  #: limit for other text files
@@ -35,11 +42,49 @@ _LONG_KEY = re.compile(
 )
 
 
+VARIABLE = "MORTARBENCH_MOST_MIB"
+DEFAULT_MIB = 2048
+MIB = 2**20  #: number of bytes in a mebibyte
+
+
+def max_bytes() -> int:
+    """Return the memory limit for a data file, in bytes; see `limit_of` for errors."""
+    return int(limit_of(VARIABLE, DEFAULT_MIB) * MIB)
+
+
+def check_size(what: str, size: int) -> None:
+    """Check that data of `size` bytes do not exceed the memory limit.
+
+    what : subject of the error message
+
+    Raises
+    ------
+    InputError
+        If the data exceed the limit; the message states the required memory in MiB, and
+        how to raise the limit.
+
+    """
+    if size > (most := max_bytes()):
+        # `//` rounds down, so a size just above the limit would be printed as the limit
+        needed = f"{max(size // MIB, most // MIB + 1)}"
+        needed = needed if size < 2**60 else "more than 10^12"
+        raise InputError(
+            f"{what} would take {needed} MiB of memory; expected at most {most // MIB} "
+            f"(set {VARIABLE} to allow more)"
+        )
+
+
 @contextmanager
 def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
     """Open a regular file for reading; pipes and devices are refused.
 
-    expected : description of the file, for messages
+    expected : description of the file, for messages, e.g. "an npz file"
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened, is not a regular file, or exceeds the limit.
+
     """
     try:
         # Check the type before opening, since opening a device may have side effects.
@@ -57,7 +102,9 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
         raise InputError(f"{path}: {wrong}; expected {expected}")
     with os.fdopen(fd, "rb") as file:
         try:
-            if os.fstat(fd).st_size == 0 and os.pread(fd, 1, 0):
+            size = os.fstat(fd).st_size
+            check_size(f"{path}: the file", size)
+            if size == 0 and os.pread(fd, 1, 0):
                 raise InputError(
                     f"{path}: declares no size, as files in /proc do; "
                     f"expected {expected}"

@@ -114,7 +114,7 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
     ------
     InputError
         If the file cannot be read, is not an npz file, is larger than
-        `harness.files.datafile` allows, or lacks one of the `expected` arrays.
+        `harness.files.reading` allows, or lacks one of the `expected` arrays.
 
     """
     try:

@@ -10,9 +10,9 @@ The requests and their answers are:
   error, and the time in which the quantities were computed. If ``fields`` is a path and
   the case defines a deformed state, this state is written to ``fields``
 
-If a case cannot be built, the answer is ``{"unbuilt": REASON, "trace": TEXT,
-"past_end": …}``; ``past_end`` is true if the case lies beyond the last problem of a
-sequence (`PastEndError`). NAME is ``{"family": …, "params": {…}, "form": …, "name":
+If a case cannot be built, the answer is ``{"unbuilt": REASON, "past_end": …}``;
+``past_end`` is true if the case lies beyond the last problem of a sequence
+(`PastEndError`). NAME is ``{"family": …, "params": {…}, "form": …, "name":
 …}``; N is the number of cases to keep in memory. The map from a point to physical
 quantities is code and cannot be stored in a file. A case whose QP is in the cache, but
 which is not in memory, is therefore built again before a point is evaluated.
@@ -20,7 +20,6 @@ which is not in memory, is therefore built again before a point is evaluated.
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -79,7 +78,6 @@ class Cases:
         except (Exception, SystemExit) as e:  # raised by code of the family
             return {
                 "unbuilt": unbuilt(fields["name"], e),
-                "trace": traceback.format_exc(),
                 "past_end": isinstance(e, PastEndError),
             }
         if "build" in request:

@@ -8,14 +8,14 @@ from datetime import UTC, datetime
 from functools import partial
 from math import inf, isinf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from mortarbench.harness.errors import FaultError, InputError
 from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.files.store import read_point
 from mortarbench.harness.plugin import Case, Reference
-from mortarbench.harness.processes.protocol import Source, source_of
+from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.scratch import scratch_folder
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
@@ -35,33 +35,34 @@ REMEMBERED_NOTE = (
 )
 
 
-class JudgedMeasurement(NamedTuple):
-    """A measurement with its verdict."""
-
-    record: Record
-    #: answer of the solver; None if the worker ended without an answer
-    solution: Solution | None
-    #: False if the worker has computed quantities and error bounds
-    needs_evaluation: bool = True
-
-
 def measure_and_judge(
     worker: WorkerProcess,
     whole: Callable[[], QP],
     record: Record,
-    request: Mapping[str, Any],
     *,
+    out: Path,
+    source: Source = Source.FILE,
+    qp_file: tuple[Path, str] | None = None,
     time_limit: float,
-    memory_limit: float,
-) -> JudgedMeasurement:
+    memory_limit: float = inf,
+    **entries: Any,
+) -> tuple[Record, Solution | None]:
     """Measure once with a worker process, and complete `record` with costs and verdict.
 
-    whole : returns the QP; not called if the worker judges the answer
-    request : request to the worker, see `harness.processes.worker`; the tolerance and
-        the memory limit are added. The worker writes the point to the file ``out``. If
-        the worker ends in a repetition of a completed solve, the QP is solved and timed
-        once in a new worker
+    If the worker ends in a repetition of a completed solve, the QP is solved and timed
+    once in a new worker.
+
+    whole : returns the QP; called if `Source.needs_case`
+    out : file to which the worker writes the point
+    source : origin of the QP. Unless `Source.needs_case`, the worker judges the answer,
+        and computes its quantities and error bounds
+    qp_file : file with the QP, and digest of its content; None if ranks build the QP
     time_limit, memory_limit : limits in s and MiB
+    entries : further entries of the request, see `harness.processes.worker`
+
+    Returns
+    -------
+    the record, and the answer of the solver or None if the worker ended without one
 
     Raises
     ------
@@ -71,11 +72,15 @@ def measure_and_judge(
         lost.
 
     """
-    request = {**request, "tol": record.tol, "judged_at": record.judged_at}
+    request = {"out": str(out), "source": source, "tol": record.tol, **entries}
+    request["judged_at"] = record.judged_at
+    if qp_file is None:
+        request["case"] = case_entry(record)
+    else:
+        request |= {"qp": str(qp_file[0]), "digest": qp_file[1]}
     if not isinf(memory_limit):
         request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
-    out, source = Path(request["out"]), source_of(request)
     try:
         out.unlink(missing_ok=True)
         ask = partial(worker.ask, time_limit=time_limit, memory_limit=memory_limit)
@@ -98,19 +103,10 @@ def measure_and_judge(
         elif reply.built is not None:
             record = record.replace(**reply.built)
         if reply.answer is None:
-            return JudgedMeasurement(record.replace(status=reply.verdict), None)
-        answer = {k: reply.answer[k] for k in ("iterations", "counts", "message")}
-        reported = reply.answer["reported"].items()
-        solution = replace(
-            read_point(out, Status(reply.answer["claimed"])),
-            **answer,
-            reported={k: v for k, v in reported if v is not None},
-        )
-    except InputError as e:
+            return record.replace(status=reply.verdict), None
+        solution = _solution(out, reply.answer)
+    except (InputError, OSError) as e:  # a file is damaged, or the disk is full
         raise FaultError(f"{record.solver} on {record.case}: {e}") from None
-    except OSError as e:
-        what = f"{e.filename or out}: {e.strerror or e}"
-        raise FaultError(f"{record.solver} on {record.case}: {what}") from None
     cost, more = _cost(reply, source)
     record = record.replace(**cost)
     if source.needs_case:
@@ -120,14 +116,22 @@ def measure_and_judge(
         fields["status"] = Verdict(fields["status"])
         record = claimed(record, solution).replace(**fields)
         more += reply.answer["notes"]
-    record = _check_memory(memory_limit, noted(record, reply.message, *notes, *more))
-    return JudgedMeasurement(record, solution, needs_evaluation=source.needs_case)
+    record = noted(record, reply.message, *notes, *more)
+    return _check_memory(memory_limit, record), solution
 
 
-def case_request(record: Record) -> dict[str, Any]:
-    """Return the entry of a request that specifies the case that the worker builds."""
-    case = {"family": record.family, "params": dict(record.params), "form": record.form}
-    return {"case": case}
+def _solution(point: Path, answer: Mapping[str, Any]) -> Solution:
+    reported = answer["reported"].items()
+    return replace(
+        read_point(point, Status(answer["claimed"])),
+        **{k: answer[k] for k in ("iterations", "counts", "message")},
+        reported={k: v for k, v in reported if v is not None},
+    )
+
+
+def case_entry(r: Record) -> dict[str, Any]:
+    """Return the specification of a case in requests, see `harness.processes.cases`."""
+    return {"family": r.family, "params": r.params, "form": r.form, "name": r.case}
 
 
 def _cost(reply: Reply, source: Source) -> tuple[dict[str, Any], list[str]]:
@@ -193,31 +197,29 @@ def measure_once(
 
     """
     with scratch_folder() as scratch:
-        request: dict[str, Any] = {"out": str(scratch / "point.npz"), "source": source}
-        if source.is_shared:
-            request |= case_request(record)
+        saved_as = None
         if source.needs_case:
-            qp_file = scratch / "qp.npz"
-            meta = {"name": record.case}
-            saved = save_qp(qp_file, case().qp, meta, serialised=True)
+            path = scratch / "qp.npz"
+            saved = save_qp(path, case().qp, {"name": record.case}, serialised=True)
             record = record.replace(qp=case().digest or saved)
             if not source.is_shared:
-                request |= {"qp": str(qp_file), "digest": content_digest(qp_file)}
+                saved_as = path, content_digest(path)
         once = partial(
             measure_and_judge,
             worker,
             lambda: case().qp,
             record,
-            request,
+            out=scratch / "point.npz",
+            source=source,
+            qp_file=saved_as,
             time_limit=time_limit,
-            memory_limit=inf,
         )
         try:
-            record, solution, needs_evaluation = once()
+            record, solution = once()
         except FaultError:
-            record, solution, needs_evaluation = once()
+            record, solution = once()
     declined = record.status is Verdict.DECLINED
-    if solution is None or declined or not needs_evaluation:
+    if solution is None or declined or not source.needs_case:
         return record, solution
     results, notes = results_of(case(), solution)
     return noted(record.replace(**results), *notes), solution

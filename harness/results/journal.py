@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from mortarbench.harness.errors import InputError, shown
-from mortarbench.harness.files.datafile import opened
 from mortarbench.harness.files.durable import sync_folder
+from mortarbench.harness.files.reading import opened
 from mortarbench.harness.record import Record
 from mortarbench.harness.results.folder import refuse_links
 
@@ -100,7 +100,7 @@ def read_lines(path: Path) -> Iterator[bytes]:
     Raises
     ------
     InputError
-        If the file is not a regular file, is larger than `harness.files.datafile`
+        If the file is not a regular file, is larger than `harness.files.reading`
         allows, or has a line longer than `MAX_LINE_BYTES`.
 
     """

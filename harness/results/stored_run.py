@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import InputError, some
 from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.record import Record
@@ -27,21 +27,21 @@ def find_record(folder: Path, name: str, records: Sequence[Record]) -> Record:
         If there is no such record, or there are several.
 
     """
-    names = [r.identity if "-" in name else r.run_id for r in records]
-    for matches in (str.__eq__, str.startswith):
-        found = [r for r, n in zip(records, names, strict=True) if matches(n, name)]
-        if len(found) == 1 and name:
-            return found[0]
-        if found and name:
-            first = ", ".join(sorted(r.identity for r in found)[:3])
-            raise InputError(
-                f"{folder} contains {len(found)} measurements whose run_id begins with "
-                f"{name!r} ({first}); give more digits, or SESSION-RUN_ID"
-            )
+    found = [r for r in records if name in (r.run_id, r.identity)]
+    found = found or [
+        r for r in records if r.run_id.startswith(name) or r.identity.startswith(name)
+    ]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise InputError(
+            f"{folder} contains {len(found)} measurements whose run_id begins with "
+            f"{name!r} ({some(sorted(r.identity for r in found))}); give more digits, "
+            "or SESSION-RUN_ID"
+        )
     near = get_close_matches(name, [r.run_id for r in records], n=1, cutoff=0.0)
     hint = f"; the nearest is {near[0]}" if near else ""
-    count = f"{len(records)} measurement{'s' * (len(records) != 1)}"
-    raise InputError(f"unknown run_id {name!r}: {folder} contains {count}{hint}")
+    raise InputError(f"unknown run_id {name!r} in {folder}{hint}")
 
 
 def case_of(record: Record, families: Mapping[str, Family]) -> CaseId:

@@ -66,7 +66,6 @@ class BuildFailure:
 
     block: WorkUnit
     reason: str  #: reason in one line
-    trace: str = ""  #: traceback of the exception if the family's code raised it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays
 from mortarbench.harness.operators import NO_MAKERS, Maker
-from mortarbench.harness.processes.measurement import case_request, measure_and_judge
+from mortarbench.harness.processes.measurement import case_entry, measure_and_judge
 from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.qp import QP
@@ -35,9 +35,10 @@ from mortarbench.harness.verify.verdicts import has_point, noted
 class BuiltCase(NamedTuple):
     """Case that the case worker has built."""
 
-    qp: Path  #: file that contains the QP, see `harness.files.qpfile`
-    digest: str  #: digest of the content of that file
+    #: file that contains the QP (`harness.files.qpfile`), and digest of its content
+    file: tuple[Path, str]
     meta: Mapping[str, Any]  #: meta data of the QP, see `harness.processes.cases`
+    qp: QP
 
 
 @dataclass(eq=False)
@@ -56,7 +57,6 @@ class Executor:
     _entries: tuple[BuiltCase, ...] = ()  # those cases, once they are built
     # reason why the sequence has fewer cases than requested steps; else empty
     _end_reason: str = ""
-    _loaded: dict[str, QP] = field(default_factory=dict)  # QPs of `_entries`, by digest
 
     def __post_init__(self) -> None:
         self._point = self.scratch / "point.npz"
@@ -85,7 +85,7 @@ class Executor:
                 for turn in block.turns:
                     yield from self._turn(block, turn)
             except _BuildError as e:
-                yield BuildFailure(block=block, reason=e.reason, trace=e.trace)
+                yield BuildFailure(block=block, reason=e.reason)
 
     def _turn(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Outcome]:
         """Measure one solver; retry once after a fault that the solver did not cause.
@@ -157,38 +157,31 @@ class Executor:
         self, block: WorkUnit, turn: tuple[Record, ...], step: int, source: Source
     ) -> Result:
         """Measure one solver on one case, and evaluate its answer."""
-        record = turn[step]
-        request: dict[str, Any] = {"out": str(self._point), "source": source}
-        if block.is_sequence:
-            request["step"] = step
+        record, qp_file = turn[step], None
+        entries: dict[str, Any] = {"step": step} if block.is_sequence else {}
         if len(turn) > 1:  # steps, whose times must not depend on the reuse of results
-            request["once"] = True
-        if source.is_shared:
-            request |= case_request(record)
+            entries["once"] = True
         if source.needs_case:
-            entry = self._entries[step]
+            built = self._entries[step]
             keys = ("qp", "build_seconds", "dualise_seconds")
-            record = record.replace(**{key: entry.meta.get(key) for key in keys})
-            if not source.is_shared:
-                request |= {"qp": str(entry.qp), "digest": entry.digest}
-
-        def whole() -> QP:
-            self._build(turn)
-            return self._qp(self._entries[step])
-
-        record, solution, needs_evaluation = measure_and_judge(
+            record = record.replace(**{key: built.meta.get(key) for key in keys})
+            qp_file = None if source.is_shared else built.file
+        record, solution = measure_and_judge(
             self._worker(record.solver),
-            whole,
+            lambda: self._entries[step].qp,
             record,
-            request,
+            out=self._point,
+            source=source,
+            qp_file=qp_file,
             time_limit=block.time_limit,
             memory_limit=block.memory_limit,
+            **entries,
         )
         if record.status in (Verdict.CRASHED, Verdict.FAILED):
             refuse_full_disk(self.scratch, "")  # a full disk may be the cause
         if solution is None or not has_point(solution):
             return Result(record=record)
-        if needs_evaluation:
+        if source.needs_case:
             return self._describe(record, solution)
         return Result(record=record, point=point_arrays(solution))
 
@@ -203,17 +196,18 @@ class Executor:
         self._end_reason = ""
         for step, record in enumerate(turn):
             path = self.scratch / f"qp{step}"
-            request = {"build": _case(record), "qp": str(path)}
+            request = {"build": case_entry(record), "qp": str(path)}
             try:
                 meta = self._ask_case_worker(request)["meta"]
-                entries.append(BuiltCase(path, content_digest(path), meta))
+                file = path, content_digest(path)
+                qp, _ = load_qp(path, operators=self.operators)
+                entries.append(BuiltCase(file, meta, qp))
             except _BuildError as e:
                 if not entries or not e.past_end:
                     raise
                 self._end_reason = e.reason
                 break
         self._entries = tuple(entries)
-        self._loaded = {e.digest: self._qp(e) for e in entries}
 
     def _describe(self, record: Record, solution: Solution) -> Result:
         """Add physical quantities and error bounds, computed by the case worker."""
@@ -221,7 +215,7 @@ class Executor:
         fields = self.scratch / "fields.npz"
         fields.unlink(missing_ok=True)
         request = {
-            "describe": _case(record),
+            "describe": case_entry(record),
             "point": str(self._point),
             "fields": str(fields) if first else None,
         }
@@ -269,13 +263,10 @@ class Executor:
             what = "built" if "build" in request else "evaluated"
             case = request.get("build") or request["describe"]
             reason = f"{case['name']} could not be {what}: {reply.message}"
-            raise _BuildError(reason, "")
+            raise _BuildError(reason)
         if "unbuilt" in reply.answer:
             refuse_full_disk(self.scratch, reply.answer["unbuilt"])
-            answer = reply.answer
-            raise _BuildError(
-                answer["unbuilt"], answer["trace"], past_end=answer["past_end"]
-            )
+            raise _BuildError(reply.answer["unbuilt"], reply.answer["past_end"])
         return reply.answer
 
     def _worker(self, label: str) -> WorkerProcess:
@@ -283,11 +274,6 @@ class Executor:
             log = self.scratch / f"worker-{len(self._workers)}.log"
             self._workers[label] = WorkerProcess(self.commands.solvers[label], log)
         return self._workers[label]
-
-    def _qp(self, entry: BuiltCase) -> QP:
-        if entry.digest not in self._loaded:
-            self._loaded[entry.digest] = load_qp(entry.qp, operators=self.operators)[0]
-        return self._loaded[entry.digest]
 
 
 def execute(
@@ -303,17 +289,7 @@ def execute(
             yield from executor.execute(block)
 
 
+@dataclass(eq=False)
 class _BuildError(Exception):
-    def __init__(self, reason: str, trace: str, *, past_end: bool = False) -> None:
-        super().__init__(reason)
-        self.reason = reason
-        self.trace = trace
-        self.past_end = past_end
-
-
-def _case(r: Record) -> dict[str, Any]:
-    """Return the NAME of a record's case in requests to the case worker.
-
-    See `harness.processes.case_worker`.
-    """
-    return {"family": r.family, "params": r.params, "form": r.form, "name": r.case}
+    reason: str
+    past_end: bool = False

@@ -7,7 +7,6 @@ folder. An executor on this machine, or executors on a cluster, measure the bloc
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -48,8 +47,6 @@ from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.suite import Suite
 from mortarbench.harness.verify.verdicts import plain
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +160,6 @@ class _Recorder:
         self.journal.check()
         match outcome:
             case BuildFailure():
-                _log.debug("%s\n%s", outcome.reason, outcome.trace)
                 if self.schedule.give_up(outcome.block):
                     self.progress.warn(outcome.reason)
                 for turn in outcome.block.turns:

@@ -36,7 +36,7 @@ from scipy.sparse.linalg import splu
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.harness.checked import located
-from mortarbench.harness.files.datafile import check_size
+from mortarbench.harness.files.reading import check_size
 from mortarbench.problems.fem.mesh_files.hdf5 import opened_hdf5
 from mortarbench.problems.files.friction_cones import FrictionalContact
 

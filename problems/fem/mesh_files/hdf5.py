@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness import InputError
-from mortarbench.harness.files.datafile import check_size, opened, parsing
+from mortarbench.harness.files.datafile import parsing
+from mortarbench.harness.files.reading import check_size, opened
 
 
 @contextmanager

@@ -154,10 +154,10 @@ def cli(capsys, monkeypatch, tmp_path):
 
 
 def test_a_run_states_measurements_prevented_by_faults(cli, monkeypatch, tmp_path):
-    def measured(worker, qp, record, request, **limits):
+    def measured(worker, qp, record, **request):
         if record.solver == "near":
             raise FaultError("the worker could not be started")
-        return remote.measure_and_judge(worker, qp, record, request, **limits)
+        return remote.measure_and_judge(worker, qp, record, **request)
 
     monkeypatch.setattr(
         "mortarbench.harness.running.executor.measure_and_judge", measured

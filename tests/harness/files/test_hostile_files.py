@@ -18,8 +18,8 @@ from scipy.sparse import csc_matrix
 
 from mortarbench.cli.main import main
 from mortarbench.harness import QP, InputError, no_rows
-from mortarbench.harness.files.datafile import VARIABLE
 from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.files.reading import VARIABLE
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.mesh_files.reading import read_msh

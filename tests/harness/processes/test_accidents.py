@@ -16,6 +16,7 @@ import pytest
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.errors import FaultError
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import supervisor
@@ -142,13 +143,11 @@ class Bench:
             CASE, SolverSpec(name=solver, label=solver),
             options={}, tol=1e-6, repeat=0, environment="",
         ).replace(qp=self.digest)  # fmt: skip
-        request = dict(
-            qp=str(self.folder / "qp.npz"), out=str(self.folder / "point.npz")
-        )
-        worker = self.workers[solver]
+        file = self.folder / "qp.npz"
         return measure_and_judge(
-            worker, lambda: self.qp, record, request, time_limit=time_limit,
-            memory_limit=self.memory_limit,
+            self.workers[solver], lambda: self.qp, record,
+            out=self.folder / "point.npz", qp_file=(file, content_digest(file)),
+            time_limit=time_limit, memory_limit=self.memory_limit,
         )[0]  # fmt: skip
 
     def process(self, solver):

@@ -13,7 +13,7 @@ import pytest
 
 import mortarbench as mb
 from mortarbench.harness import InputError
-from mortarbench.harness.files.datafile import VARIABLE
+from mortarbench.harness.files.reading import VARIABLE
 from mortarbench.problems.files.fclib import read_fclib, to_contact
 from mortarbench.problems.files.friction_cones import FrictionalContact
 from tests.support.box_stack import (
