@@ -5,19 +5,18 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any
 
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.plugin import Family, Reference, Solver
 from mortarbench.harness.processes.locks import ForkSafeLock
-from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.harness.registry import (
     Plugin,
     PluginFile,
@@ -45,11 +44,6 @@ TURN = ForkSafeLock()
 #: Python files that define SOLVERS or PROBLEMS; a string may have the form
 #: LABEL=FILE.py. The text is the option of commands
 Plugins = Annotated[Sequence[str | Path | PluginFile], "--plugin [LABEL=]FILE.py"]
-
-
-#: function that writes a report on a folder in several formats, with the argument
-#: `factor`, and returns its files and main sentences; see `mortarbench.report`
-Reporter: TypeAlias = Callable[..., tuple[list[Path], list[str]]]
 
 
 def _plugin_files(files: Plugins) -> list[PluginFile]:
@@ -118,15 +112,6 @@ def reference(qp: QP) -> Solution:
     return reference_solution(qp, lambda qp, s: kkt_residuals(qp, s).worst)
 
 
-def report_folder(
-    folder: Path, formats: Sequence[str], *, factor: float = VERIFIED_FACTOR
-) -> tuple[list[Path], list[str]]:
-    """Write the built-in report on a folder; return its files and main sentences."""
-    from mortarbench.reports.folder import write_report
-
-    return write_report(folder, formats, factor)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Registries:
     """Families, solvers and operators, and the commands that start processes."""
@@ -134,7 +119,6 @@ class Registries:
     families: Mapping[str, Family] = field(default_factory=lambda: PROBLEMS)
     solvers: Mapping[str, Solver] = field(default_factory=lambda: SOLVERS)
     reference: Reference = reference
-    report: Reporter = report_folder
     #: functions that construct an operator P, see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
     #: operators that do not come from plug-in files

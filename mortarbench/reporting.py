@@ -118,7 +118,11 @@ def report(
                 "fail_on and pair need two folders, or two solvers; expected "
                 "report DIR DIR2, or report DIR --compare OLD,NEW"
             )
-        return _report(registries, first, formats, factor)
+        from mortarbench.reports.folder import write_report
+
+        with report_full_disk(first):
+            files, said = write_report(first, formats, factor)
+        return Report(files=tuple(files), said=tuple(said))
     from mortarbench.reports.measurements import read_measurements
 
     with ExitStack() as stack:
@@ -143,15 +147,6 @@ def report(
         failed_on=tuple(dict.fromkeys(what for r in found for what in r.failed_on)),
         undecided=any(r.undecided for r in found),
     )
-
-
-def _report(
-    registries: Registries, folder: Path, formats: Sequence[str], factor: float
-) -> Report:
-    """Write the report of a folder, by the function of the registries."""
-    with report_full_disk(folder):
-        files, said = registries.report(folder, formats, factor=factor)
-    return Report(files=tuple(files), said=tuple(said))
 
 
 def _gates(fail_on: Sequence[str]) -> dict[str, float]:

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,14 +18,14 @@ from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.progress import display_on
 from mortarbench.registries import Registries
-from tests.support import TOY_PROBLEM
+from tests.support import TOY_PROBLEM, WRITE_REPORT
 from tests.support.waiting import LONGEST, is_alive
 
 SOLVERS = load_plugin(TOY_PROBLEM).solvers
 FAMILIES = load_plugin(TOY_PROBLEM).problems
 
 
-def report(folder, formats, *, factor=10.0):
+def report(folder, formats, factor):
     name = "index" if factor == 10 else f"index-{factor:g}"
     return [folder / f"{name}.{f}" for f in formats], []
 
@@ -43,7 +42,6 @@ def registries(tmp_path):
         families=FAMILIES,
         solvers=SOLVERS,
         reference=lambda qp: SOLVERS["exact"].prepare(qp, 0.0)(),
-        report=report,
         suites=suites,
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
     )
@@ -53,6 +51,7 @@ def registries(tmp_path):
 def cli(registries, capsys, monkeypatch, tmp_path):
     """Run a command line in an empty folder; return its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(WRITE_REPORT, report)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
 
     def cli(*argv):
@@ -323,11 +322,14 @@ def test_an_ascii_terminal_is_sufficient(tmp_path):
     assert "? ? 0." in done.stdout
 
 
-def test_a_file_that_cannot_be_written_is_named(registries, capsys, tmp_path):
-    def report(folder, formats, **_):
+def test_a_file_that_cannot_be_written_is_named(
+    registries, capsys, monkeypatch, tmp_path
+):
+    def report(folder, formats, factor):
         raise PermissionError(13, "Permission denied", str(folder / "index.html"))
 
-    assert main(replace(registries, report=report), ["report", str(tmp_path)]) == 2
+    monkeypatch.setattr(WRITE_REPORT, report)
+    assert main(registries, ["report", str(tmp_path)]) == 2
     assert capsys.readouterr().err == (
         f"mortarbench: {tmp_path}/index.html: Permission denied\n"
     )

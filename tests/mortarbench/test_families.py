@@ -32,7 +32,6 @@ CASES = [
 def test_the_default_case_is_solved_and_verified_in_every_form(name, form, capsys):
     registries = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=None,
     )  # fmt: skip
     declined = SOLVERS["smalbe"].declines(
         PROBLEMS[name].build(form, reference_solution).qp

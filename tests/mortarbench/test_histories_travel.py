@@ -24,7 +24,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.verify.measure import measure
 from mortarbench.registries import Registries
 from mortarbench.text import convergence
-from tests.support import HISTORIES, TOY_PROBLEM
+from tests.support import HISTORIES, TOY_PROBLEM, WRITE_REPORT, no_report
 from tests.support.stored import save_solution
 
 PLUGIN = load_plugin(HISTORIES)
@@ -46,12 +46,12 @@ def cli(capsys, monkeypatch, tmp_path):
     and stderr.
     """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(WRITE_REPORT, no_report)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     toy = load_plugin(TOY_PROBLEM)
     nothing = {}
     registries = Registries(
         families=toy.problems, solvers=toy.solvers,
-        report=lambda *_, **__: ([], []),
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         reference=unsolved, **nothing,
     )  # fmt: skip

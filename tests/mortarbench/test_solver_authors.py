@@ -20,7 +20,7 @@ from mortarbench.harness.suite.suite import load_suite
 from mortarbench.progress import waiting
 from mortarbench.registries import Registries
 from mortarbench.validation import Conformance
-from tests.support import TOY_PROBLEM
+from tests.support import TOY_PROBLEM, WRITE_REPORT, no_report
 from tests.support.waiting import soon
 
 TOY = load_plugin(TOY_PROBLEM)
@@ -56,11 +56,11 @@ SOLVERS = {"mine": Mine()}
 def cli(capsys, monkeypatch, tmp_path):
     """Run a command line in an empty folder; return its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(WRITE_REPORT, no_report)
     registries = Registries(
         families=TOY.problems,
         solvers=TOY.solvers,
         reference=lambda qp: TOY.solvers["exact"].prepare(qp, 0.0)(),
-        report=lambda *_, **__: ([], []),
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
     )
 

@@ -179,8 +179,5 @@ def unsolved(qp):
 
 
 if __name__ == "__main__":
-    nothing = {"report": None}
-    registries = Registries(
-        families=PROBLEMS, solvers=SOLVERS, reference=unsolved, **nothing
-    )
+    registries = Registries(families=PROBLEMS, solvers=SOLVERS, reference=unsolved)
     sys.exit(main(registries, sys.argv[1:]))

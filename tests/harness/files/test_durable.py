@@ -25,7 +25,7 @@ from mortarbench.harness.files.durable import (
 from mortarbench.harness.processes import measurement as remote
 from mortarbench.harness.registry import load_plugin
 from mortarbench.registries import Registries
-from tests.support import TOY_PROBLEM
+from tests.support import TOY_PROBLEM, WRITE_REPORT, no_report
 
 
 @contextmanager
@@ -125,23 +125,19 @@ forms = ["dual"]
 """
 
 
-def no_report(folder, _formats, *, factor=10.0):
-    return [], []
-
-
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
     """Return a function that runs a command line on the toy problem in a folder that
     contains only a suite; it returns the exit code, stdout and stderr.
     """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(WRITE_REPORT, no_report)
     (tmp_path / "toy.toml").write_text(SUITE)
     plugin = load_plugin(TOY_PROBLEM)
     nothing = {"reference": None}
     registries = Registries(
         families=plugin.problems,
         solvers=plugin.solvers,
-        report=no_report,
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         **nothing,
     )

@@ -53,8 +53,6 @@ def command(capsys):
     """Run the command line; return exit code, stdout and stderr."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda *_, **__: ([], []),
-
     )  # fmt: skip
 
     def run(*arguments):

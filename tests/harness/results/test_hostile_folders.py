@@ -16,7 +16,6 @@ from mortarbench.harness.files.store import (
 from mortarbench.harness.results.journal import Journal
 from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from mortarbench.reports.folder import write_report
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.harness.files.test_hostile_files import hostile
@@ -64,7 +63,6 @@ def command(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=write_report,
     )  # fmt: skip
 
     def run(*arguments):

@@ -34,17 +34,12 @@ params = { depth = [1, 2] }
 """
 
 
-def no_report(folder, formats, *, factor=10.0):
-    return [], []
-
-
 @pytest.fixture(scope="module")
 def registries():
     nothing = {"reference": None}
     return Registries(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
-        report=no_report,
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         **nothing,
     )
@@ -191,7 +186,7 @@ def test_a_case_with_a_changed_file_is_refused(cli, manufactured, tmp_path):
         'name = "a"\nrepeats = 1\nsolvers = ["osqp"]\n'
         '[[problems]]\nfamily = "file"\nparams = { path = "a.npz" }\n'
     )
-    ours = Registries(report=no_report)
+    ours = Registries()
     code, _, err = cli("run", "a.toml", "--out", "done", registries=ours)
     assert code == 0, err
     (record,) = read_journal(tmp_path / "done")

@@ -20,7 +20,7 @@ from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.folder import environment_of
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
-from tests.support import ROOT, TOY_PROBLEM
+from tests.support import ROOT, TOY_PROBLEM, WRITE_REPORT, no_report
 from tests.support.waiting import soon
 
 if find_spec("distributed") is None:
@@ -107,6 +107,7 @@ def cli(capsys, monkeypatch, tmp_path):
     suite; it returns the exit code, stdout and stderr.
     """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(WRITE_REPORT, no_report)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
     (tmp_path / "toy.toml").write_text(suite_of(CASES))
@@ -114,7 +115,6 @@ def cli(capsys, monkeypatch, tmp_path):
     registries = Registries(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
-        report=lambda *_, **__: ([], []),
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         **nothing,
     )
@@ -333,7 +333,7 @@ def start(*arguments, **how):
         "nothing = {'reference': None}; "
         "sys.exit(main(Registries(families=toy_problem.PROBLEMS, "
         "solvers=toy_problem.SOLVERS, "
-        "report=lambda *_, **__: ([], []), **nothing, "
+        "**nothing, "
         "start=(sys.executable, '-P', toy_problem.__file__)), sys.argv[2:]))"
     )
     command = [sys.executable, "-c", program, str(TOY_PROBLEM.parent)]

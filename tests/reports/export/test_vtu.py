@@ -265,8 +265,6 @@ def solve(tmp_path, capsys):
     """Solve a case with --vtu; return exit code, stderr and the file."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda *_, **__: ([], []),
-
     )  # fmt: skip
 
     def solve(case, name="a.vtu"):
