@@ -439,13 +439,14 @@ def check_symmetric(P: Matrix) -> None:
         difference, and a hint if P is triangular.
 
     """
-    where, worst = _asymmetry(P)
+    difference = coo_array(abs(P - P.T))
     largest = abs(P).max() if prod(P.shape) else 0.0
-    if worst > SYMMETRY_TOLERANCE * largest:
-        i, j = where
+    if difference.nnz and difference.data.max() > SYMMETRY_TOLERANCE * largest:
+        k = int(difference.data.argmax())
+        i, j = (int(index[k]) for index in difference.coords)
         raise ValueError(
-            f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by {worst:.3g}"
-            f"{_triangle(P)}"
+            f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by "
+            f"{difference.data[k]:.3g}{_triangle(P)}"
         )
 
 
@@ -498,16 +499,6 @@ def _triangle(P: Matrix) -> str:
                 "P + P.T - diag(diag(P))"
             )
     return ""
-
-
-def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
-    """Return the indices (i, j) and the value of the largest entry of |P − Pᵀ|."""
-    difference = coo_array(abs(P - P.T))
-    if not difference.nnz:
-        return (0, 0), 0.0
-    at = int(difference.data.argmax())
-    i, j = (int(k[at]) for k in difference.coords)
-    return (i, j), float(difference.data[at])
 
 
 def canonical(M: Matrix) -> Matrix:

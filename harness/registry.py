@@ -241,7 +241,7 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
     wildcard = f"{prefix}:*"
     if colon and wildcard in solvers and (backend == "*" or spec.name not in solvers):
         solver = _with_backend(prefix, backend, solvers[wildcard])
-        return _with_options(spec, solver, reserved={"backend"})
+        return _with_options(spec, solver, reserved="backend")
     check_name(spec.name, solvers)
     return _with_options(spec, solvers[spec.name])
 
@@ -483,18 +483,15 @@ def _with_backend(prefix: str, backend: str, solver: Any) -> Solver:
     return configured
 
 
-def _with_options(
-    spec: SolverSpec, solver: Any, *, reserved: set[str] | None = None
-) -> Solver:
+def _with_options(spec: SolverSpec, solver: Any, reserved: str = "") -> Solver:
     changes: dict[str, Any] = {}
     settings: dict[str, Any] = {}
     for name, value in spec.options.items():
         known = known_options(solver, name)
-        for other in reserved or ():
-            known.pop(other, None)
+        known.pop(reserved, None)
         if name in known:
             value = option_value(f"{spec.name}: {name}", value, solver, name)
-        elif name in (reserved or ()) or not accepts_any(solver):
+        elif name == reserved or not accepts_any(solver):
             raise unknown("option", name, known, where=spec.name)
         own = any(f.name == name for f in fields(solver))
         (changes if own else settings)[name] = value

@@ -178,19 +178,16 @@ class Results:
         return "\n".join(text)
 
 
+#: fields that name a measurement, and its verdict
+_NAMED = (
+    "session", "run_id", "case", "solver", "tol", "repeat", "status", "claimed",
+    "message",
+)  # fmt: skip
+
+
 def _named(r: Record) -> dict[str, Any]:
     """Return the identity and the verdict of a measurement."""
-    return {
-        "session": r.session,
-        "run_id": r.run_id,
-        "case": r.case,
-        "solver": r.solver,
-        "tol": r.tol,
-        "repeat": r.repeat,
-        "status": r.status.value,
-        "claimed": r.claimed,
-        "message": r.message,
-    }
+    return {name: getattr(r, name) for name in _NAMED}
 
 
 def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results:

@@ -45,20 +45,6 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
         return read_point(_path(folder, digest), status)
 
 
-def load_history(folder: Path, digest: str) -> History:
-    """Load only the history of a stored point; the result is empty if none was stored.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or damaged, or its content does not match `digest`.
-
-    """
-    with _restorable():
-        path, arrays = _as_stored(folder, digest, ())
-        return _history(path, arrays)
-
-
 def field_arrays(fields: Fields) -> Arrays:
     """Return the arrays of a deformed state by name."""
     arrays = {**vars(fields)}
@@ -79,7 +65,10 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
     """
     with _restorable():
-        _, arrays = _as_stored(folder, digest, ("points", "displacement"))
+        path = _path(folder, digest)
+        arrays = read_arrays(path, ("points", "displacement"))
+        if digest_of(arrays) != digest:
+            raise InputError(f"{path}: its content does not match its digest")
     sides: list[ContactSide] = []
     while side := _with_prefix(_SIDE.format(len(sides)), arrays):
         sides.append(ContactSide(name=str(side.pop("name")), **side))
@@ -163,17 +152,6 @@ def _restorable() -> Iterator[None]:
         yield
     except InputError as e:
         raise InputError(f"{e}; restore the file, or run with --fresh") from None
-
-
-def _as_stored(
-    folder: Path, digest: str, expected: tuple[str, ...]
-) -> tuple[Path, dict[str, NDArray[Any]]]:
-    """Check that stored arrays match `digest`, and return their path and the arrays."""
-    path = _path(folder, digest)
-    arrays = read_arrays(path, expected)
-    if digest_of(arrays) != digest:
-        raise InputError(f"{path}: its content does not match its digest")
-    return path, arrays
 
 
 def is_stored(folder: Path, digest: str) -> bool:

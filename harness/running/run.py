@@ -7,8 +7,7 @@ folder. An executor on this machine, or executors on a cluster, measure the bloc
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from secrets import token_hex
@@ -18,7 +17,7 @@ from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.files.store import save
 from mortarbench.harness.plugin import Solver
-from mortarbench.harness.processes.termination import TerminatedError, ended_by_signals
+from mortarbench.harness.processes.termination import ended_by_signals
 from mortarbench.harness.record import Record, finite
 from mortarbench.harness.registry import SolverSpec, options_of
 from mortarbench.harness.results.folder import (
@@ -95,7 +94,6 @@ def run(
     options = {s.label: options_of(resolve(s)) for s in suite.solvers}
     with (
         ended_by_signals(),
-        _continuation_told(progress),
         report_full_disk(out),
         lock_folder(out),
     ):
@@ -206,15 +204,6 @@ class _Recorder:
         if record.run_id not in self._counted:
             self._counted.add(record.run_id)
             self.progress.advance(result)
-
-
-@contextmanager
-def _continuation_told(progress: Progress) -> Iterator[None]:
-    try:
-        yield
-    except TerminatedError:
-        progress.warn("terminated; the same command continues")
-        raise
 
 
 def _check_same(

@@ -134,7 +134,8 @@ class Schedule:
                 for case in group.cases
             )
             if is_given_up or all(map(self.is_settled, turn)):
-                self._skip(len(turn))
+                for _ in turn:
+                    self.progress.advance(None)
             else:
                 turns.append(turn)
         if not turns:
@@ -153,10 +154,6 @@ class Schedule:
             time_limit=self.suite.file.time_limit,
             memory_limit=self.suite.file.memory_limit,
         )
-
-    def _skip(self, cells: int) -> None:
-        for _ in range(cells):
-            self.progress.advance(None)
 
 
 def _cell(record: Record) -> Cell:

@@ -62,9 +62,7 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
     except InputError as e:
         return _print_error(str(e))
     except KeyboardInterrupt:
-        continues = argv[:1] in (["run"], ["dataset"])
-        goes_on = "; the same command continues" if continues else ""
-        _print_error(f"interrupted{goes_on}")
+        _print_error(_ended("interrupted", argv))
         return 130
     except BrokenPipeError:  # e.g. `mortarbench list solvers | head -1`
         _discard_output()
@@ -107,12 +105,17 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
             text = re.sub(r"^\w+(?=:? )", lambda m: parser.option(m[0]), str(e))
             raise InputError(text) from None
         except TerminatedError:
-            if argv[:1] != ["run"]:  # `run` prints its own message
-                _print_error("terminated")
+            _print_error(_ended("terminated", argv))
             raise
         # flush here, where `main` handles a closed pipe, not at interpreter exit
         print(end="", flush=True)
     return code
+
+
+def _ended(how: str, argv: Sequence[str]) -> str:
+    """Return the message for an interrupted or terminated command."""
+    continues = argv[:1] in (["run"], ["dataset"])
+    return f"{how}; the same command continues" if continues else how
 
 
 def _file_error(e: OSError, path: Path) -> str:

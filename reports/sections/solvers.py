@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 
 from mortarbench.harness import InputError, Verdict
-from mortarbench.harness.files.store import load_history
+from mortarbench.harness.files.store import load_solution
 from mortarbench.harness.record import PROVEN, REFUTED
-from mortarbench.harness.solution import History
+from mortarbench.harness.solution import History, Status
 from mortarbench.reports.answer import Row, growth_of, with_errors
 from mortarbench.reports.document import (
     ABSENT,
@@ -341,7 +341,7 @@ def _histories(run: Measurements) -> Iterator[tuple[str, float, dict[str, Histor
         here = of[(of.case == case) & (of.tol == tol)].drop_duplicates("solver")
         for solver, vectors in zip(here.solver, here.vectors, strict=True):
             with suppress(InputError):  # a report needs only the journal
-                history = load_history(run.folder, vectors)
+                history = load_solution(run.folder, vectors, Status.SOLVED).history
                 if history and len(next(iter(history.values()))):
                     found[str(solver)] = history
         if found:

@@ -22,7 +22,6 @@ from mortarbench.harness import InputError, Solution, Status
 from mortarbench.harness.files.reading import toml
 from mortarbench.harness.files.store import (
     load_fields,
-    load_history,
     load_solution,
     point_arrays,
     save,
@@ -250,7 +249,7 @@ def test_damaged_vectors_are_read_or_refused(tmp_path, count):
     for i in range(count):
         data = damaged_files.damaged(chance, whole[i % 2], whole)
         paths[i % 2].write_bytes(data)
-        for load in (load_fields, load_history, load_claim):
+        for load in (load_fields, load_claim):
             tried(data, lambda load=load, i=i: load(tmp_path, digests[i % 2]))
 
 

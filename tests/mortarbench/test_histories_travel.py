@@ -16,7 +16,6 @@ from mortarbench.cli.main import main
 from mortarbench.harness import Solution, Status
 from mortarbench.harness.conformance.manufactured import manufactured as drawn
 from mortarbench.harness.files.store import (
-    load_history,
     load_solution,
 )
 from mortarbench.harness.registry import load_plugin
@@ -151,11 +150,10 @@ def test_a_history_is_stored_with_its_point_bit_for_bit(tmp_path, point):
     loaded = load_solution(tmp_path, digest, Status.SOLVED)
 
     assert loaded.x.tolist() == [1, 2]
-    for found in (loaded.history, load_history(tmp_path, digest)):
-        assert found.keys() == history.keys()
-        for name, column in history.items():
-            assert found[name].dtype == column.dtype
-            assert found[name].tobytes() == column.tobytes()
+    assert loaded.history.keys() == history.keys()
+    for name, column in history.items():
+        assert loaded.history[name].dtype == column.dtype
+        assert loaded.history[name].tobytes() == column.tobytes()
 
 
 def test_solve_turns_the_history_on_and_prints_its_columns_as_lists(cli):
@@ -216,7 +214,8 @@ def test_a_run_stores_histories_if_the_suite_requests_them(cli, tmp_path, kept):
     records = read_journal(tmp_path / "out")
     assert (code, len(records)) == (0, 2)
     for record in records:
-        history = dict(load_history(tmp_path / "out", record.vectors))
+        stored = load_solution(tmp_path / "out", record.vectors, Status.SOLVED)
+        history = dict(stored.history)
         history.pop("seconds", None)
         found = {name: column.tolist() for name, column in history.items()}
         assert found == (TOLD if kept else {})

@@ -9,7 +9,6 @@ from mortarbench.cli.main import main
 from mortarbench.harness import InputError, Record, Verdict
 from mortarbench.harness.files.store import (
     load_fields,
-    load_history,
     load_solution,
     save,
 )
@@ -124,7 +123,7 @@ def test_malformed_digests_open_no_file(tmp_path, digest):
     save(folder, FIELDS)
     np.savez(tmp_path / "outside.npz", **FIELDS)
 
-    for load in (load_fields, load_history, lambda f, d: load_solution(f, d, "solved")):
+    for load in (load_fields, lambda f, d: load_solution(f, d, "solved")):
         with pytest.raises(InputError, match="is not a digest"):
             load(folder, digest)
 
