@@ -140,7 +140,7 @@ class QP:
             if array.shape != shape:
                 raise ValueError(f"QP.{name} has shape {array.shape}, expected {shape}")
         for name in ("q", "b", "h"):
-            _check_finite(f"QP.{name}", arrays[name])
+            _check_finite(name, arrays[name])
         every = _without_intervals((box, *further[has_box:]), n)
         values = {**arrays, "sets": every, "structure": structure}
         for name, value in values.items():
@@ -236,8 +236,7 @@ class QP:
             limits = with_infinities(limits)
             kept = limits != np.inf
             equalities, sides = _rows("A", A, "b", b, n)
-            _check_finite("q", vector)
-            _check_finite("b", sides)
+            # rows are numbered before those without a limit are dropped
             _check_finite("h", np.where(kept, limits, 0.0))
             qp = cls(
                 P=hessian,

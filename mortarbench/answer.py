@@ -10,6 +10,7 @@ import json
 from collections.abc import Mapping
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from sys import stderr
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,8 +20,7 @@ from mortarbench.harness import Record, Solver, Verdict, checked
 from mortarbench.harness.distributed.mpi import ranks_asked, too_few_parts
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.names import assemble, family_name
-from mortarbench.harness.processes.scratch import scratch_folder, single_worker
-from mortarbench.harness.processes.solver_file import write_solver
+from mortarbench.harness.processes.scratch import single_worker
 from mortarbench.harness.processes.termination import ended_by_signals
 from mortarbench.harness.record import finite
 from mortarbench.harness.registry import (
@@ -63,9 +63,8 @@ class Answer:
     record: Record  #: measurement, as in a line of a journal
     #: point and claim of the solver; None if its process ended without an answer
     solution: Solution | None
-    spec: SolverSpec  #: name and options of the solver
     solver: str | Solver  #: name or object, as passed to `solve`
-    defaults: Mapping[str, Any]  #: default options of the solver
+    options: Mapping[str, Any]  #: options, as passed to `solve`
     #: possible mistakes in the input, and reasons to doubt a verified answer, one line
     #: each
     remarks: tuple[str, ...] = ()
@@ -222,7 +221,7 @@ class Answer:
                 Case(id=case_id, registries=self.case.registries),
                 self.solver,
                 self.record.tol,
-                options=self.spec.options,
+                options=self.options,
             )
             if not earlier.has_point:
                 raise InputError(
@@ -235,7 +234,7 @@ class Answer:
 
     def __repr__(self) -> str:
         notes = (f"note: {text}" for text in self.remarks)
-        return "\n".join([outcome(self.record, self.defaults), *notes])
+        return "\n".join([outcome(self.record, self.options), *notes])
 
 
 @TURN
@@ -322,13 +321,13 @@ def solve(
     with ExitStack() as stack:
         worker = None
         if parts >= ranks:
-            scratch = stack.enter_context(scratch_folder())
-            copy = None if isinstance(solver, str) else scratch / "solver.pickle"
-            if copy is not None:
-                write_solver(copy, resolve(with_history(spec, solvers), solvers))
-            command = registries.worker_command(spec, copy, records=True)
+            command = partial(registries.worker_command, spec, records=True)
+            is_object = not isinstance(solver, str)
+            copied = (
+                resolve(with_history(spec, solvers), solvers) if is_object else None
+            )
             # The worker imports its libraries while this process imports its own.
-            worker = stack.enter_context(single_worker(command))
+            worker = stack.enter_context(single_worker(command, copied))
         defer_parts_of_numpy()
         problem = as_case(case, registries=registries)
 
@@ -336,8 +335,6 @@ def solve(
         from mortarbench.harness.verify.verdicts import new_record
 
         spec = with_history(spec, solvers)
-        plain = SolverSpec(name=name, label=name)
-        default = plain if "history" in requested else with_history(plain, solvers)
         record = new_record(
             problem.id,
             spec,
@@ -357,9 +354,8 @@ def solve(
         case=problem,
         record=record,
         solution=solution,
-        spec=spec,
         solver=solver,
-        defaults=options_of(resolve(default, solvers)),
+        options=requested,
         remarks=notes,
     )
 

@@ -122,9 +122,7 @@ def suites(*, registries: Registries | None = None) -> Listing:
     True
 
     """
-    folder = load_registries(
-        (), Registries() if registries is None else registries
-    ).suites
+    folder = (registries or Registries()).suites
     return Listing(
         {"name": path.stem, "description": first_comment(path), "path": str(path)}
         for path in sorted(folder.glob("*.toml"), key=attrgetter("stem"))

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from mortarbench.harness import checked
-from mortarbench.harness.errors import InputError, shown, unknown
+from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.registries import Registries, load_registries
 
 if TYPE_CHECKING:
     from mortarbench.reports.compare import Change
@@ -75,7 +74,6 @@ def report(
     fail_on: Annotated[Sequence[str], "worse,slower=1.2"] = (),
     compare: Annotated[Sequence[str], "OLD,NEW"] = (),
     pair: Annotated[Sequence[str], "A=B"] = (),
-    registries: Registries | None = None,
 ) -> Report:
     """Write a report on a result folder, or on changes.
 
@@ -90,8 +88,6 @@ def report(
         slower by the given factor (slower=1.2), and with 2 if this cannot be told
     compare : report the change from the solver OLD to the solver NEW in DIR
     pair : compare the solver A of DIR with the solver B of DIR2
-    registries : used instead of the built-in registries, for the function that writes
-        the report
 
     Raises
     ------
@@ -109,7 +105,6 @@ def report(
     formats = checked.names("formats", "format", formats, FORMATS)
     gates = _gates(fail_on)
     factor = checked.positive("factor", factor)
-    registries = load_registries((), Registries() if registries is None else registries)
     first = checked.result_folder("folder", folder)
     after = [checked.result_folder("others", o) for o in others if o is not None]
     if not (after or compare):
@@ -129,8 +124,12 @@ def report(
         stack.enter_context(report_full_disk(first))
         before = read_measurements(first, factor)
         if compare:
-            old, new = _two(checked.texts("compare", compare), "compare")
-            pairs = [(_solver(before, old), _solver(before, new))]
+            labels = checked.names("compare", "solver", compare, before.solvers)
+            if len(labels) != 2:
+                raise InputError(
+                    f"compare = {shown(labels)}; expected two labels, OLD,NEW"
+                )
+            pairs = [(labels[0], labels[1])]
             target = first / "report" / "compared"
             return _changes(before, before, pairs, target, formats, gates)
         found = []
@@ -162,18 +161,6 @@ def _gates(fail_on: Sequence[str]) -> dict[str, float]:
             )
         gates[text.partition("=")[0]] = limit
     return gates
-
-
-def _two(names: Sequence[str], what: str) -> tuple[str, str]:
-    if len(names) != 2:
-        raise InputError(f"{what} = {shown([*names])}; expected two labels, OLD,NEW")
-    return names[0], names[1]
-
-
-def _solver(run: Measurements, label: str) -> str:
-    if label not in run.solvers:
-        raise unknown("solver", label, run.solvers, where=str(run.folder))
-    return label
 
 
 def _pairs(

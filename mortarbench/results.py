@@ -20,7 +20,7 @@ from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.errors import shown as given
 from mortarbench.harness.files.reading import toml
 from mortarbench.harness.record import REFUTED, Record, Verdict
-from mortarbench.harness.registry import is_solver, resolve
+from mortarbench.harness.registry import resolve
 from mortarbench.harness.results.folder import keep_environment, refuse_links
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.solver_options import listed_options, selected, sweep
@@ -263,16 +263,6 @@ def merge(
     return Results(folder=target, records=tuple(records))
 
 
-def _refuse_objects(solvers: object) -> None:
-    """Check that no solver is an object, because result folders store only names."""
-    for one in solvers if isinstance(solvers, list | tuple) else [solvers]:
-        if is_solver(one):
-            raise InputError(
-                "a suite cannot contain solver objects, only names; pass "
-                "plugins=['FILE.py'] and name the solver"
-            )
-
-
 @TURN
 def run(
     suite: Annotated[str | Path | Mapping[str, Any], "SUITE.toml"],
@@ -342,9 +332,6 @@ def run(
     ['verified', 'verified']
 
     """
-    _refuse_objects(solvers)
-    if isinstance(suite, Mapping):
-        _refuse_objects(suite.get("solvers"))
     registries = load_registries(plugins, registries)
     folder = None if out is None else checked.path("out", out)
     if not isinstance(dask, str | None):

@@ -152,16 +152,12 @@ def summary(records: Sequence[Record], solvers: Sequence[str]) -> str:
     return align(rows, right=range(1, len(header)))
 
 
-def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
+def outcome(r: Record, options: Iterable[str]) -> str:
     """Return the results of one measurement as rows of name and value, in SI units.
 
-    defaults : default options of the solver; options with these values are omitted
+    options : names of the options to show
     """
-    options = ", ".join(
-        f"{key}={value}"
-        for key, value in r.options.items()
-        if key not in defaults or value != defaults[key]
-    )
+    chosen = ", ".join(f"{key}={r.options[key]}" for key in options)
     per = "" if in_space(r.quantities) else "/m"
     units = _units(per) if "dofs" in r.quantities else {}
     several = r.inner > 1
@@ -169,7 +165,7 @@ def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
     rows = [
         ("case", r.case),
         ("size", ", ".join(f"{count} {what}" for what, count in r.sizes.items())),
-        ("solver", f"{r.solver} ({options})" if options else r.solver),
+        ("solver", f"{r.solver} ({chosen})" if chosen else r.solver),
         ("tolerance", f"{r.tol:g}"),
         ("status", f"{r.status.words} (claimed {r.claimed})"),
         ("message", r.message),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -221,22 +221,14 @@ def test_solver(
     if isinstance(solver, str):
         resolve(spec, registries.solvers)
     from mortarbench.harness.conformance.conformance import CHECKS
-    from mortarbench.harness.processes.scratch import scratch_folder
-    from mortarbench.harness.processes.solver_file import write_solver
-    from mortarbench.harness.processes.supervisor import WorkerProcess
+    from mortarbench.harness.processes.scratch import single_worker
 
     names = list(CHECKS if checks is None else checks)
     for check in names:
         if check not in CHECKS:
             raise unknown("check", str(check), CHECKS)
-    with scratch_folder() as scratch, ExitStack() as stack:
-        copy = None
-        if not isinstance(solver, str):
-            copy = scratch / "solver.pickle"
-            write_solver(copy, solver)
-        command = registries.worker_command(spec, copy)
-        worker = WorkerProcess(command, scratch / "worker.log")
-        stack.callback(worker.close)
+    copied = None if isinstance(solver, str) else solver
+    with single_worker(partial(registries.worker_command, spec), copied) as worker:
         results = {}
         for number, check in enumerate(names, start=1):
             progress(f"{name}: check {number} of {len(names)}, {check}")

@@ -44,7 +44,7 @@ from mortarbench.harness.files.datafile import json_object
 from mortarbench.harness.files.durable import writing
 from mortarbench.harness.files.mapped import read_mapped, write_mapped
 from mortarbench.harness.files.reading import check_size
-from mortarbench.harness.files.store import digest_of, read_arrays
+from mortarbench.harness.files.store import digest_of, read_arrays, with_prefix
 from mortarbench.harness.operators import Maker, SerialisableOperator, assembled
 from mortarbench.harness.qp import (
     QP,
@@ -234,7 +234,8 @@ def _serialised_qp(
     vectors: dict[str, Any] = {name: arrays[name] for name in VECTORS}
     if "maker" in meta:
         n, maker = vectors["q"].size, str(meta["maker"])
-        matrices["P"] = SerialisableOperator(n, maker, _ingredients(arrays), operators)
+        ingredients = with_prefix(_INGREDIENT, arrays)
+        matrices["P"] = SerialisableOperator(n, maker, ingredients, operators)
     structure = None
     if "fixed" in arrays:
         K, B = (_matrix(arrays, name) for name in _STRUCTURE)
@@ -305,14 +306,6 @@ def check_dense(name: str, M: Matrix) -> None:
 
     """
     check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))
-
-
-def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    return {
-        name.removeprefix(_INGREDIENT): array
-        for name, array in arrays.items()
-        if name.startswith(_INGREDIENT)
-    }
 
 
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:

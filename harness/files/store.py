@@ -70,10 +70,10 @@ def load_fields(folder: Path, digest: str) -> Fields:
         if digest_of(arrays) != digest:
             raise InputError(f"{path}: its content does not match its digest")
     sides: list[ContactSide] = []
-    while side := _with_prefix(_SIDE.format(len(sides)), arrays):
+    while side := with_prefix(_SIDE.format(len(sides)), arrays):
         sides.append(ContactSide(name=str(side.pop("name")), **side))
     known = {k: v for k, v in arrays.items() if not k.startswith((_NODAL, "side_"))}
-    nodal = _with_prefix(_NODAL, arrays)
+    nodal = with_prefix(_NODAL, arrays)
     return Fields(nodal=nodal, contacts=tuple(sides), **known)
 
 
@@ -131,12 +131,12 @@ def point_arrays(solution: Solution) -> Arrays:
 def _history(path: Path, arrays: Arrays) -> History:
     """Return the history stored with a point; it is empty for files of old versions."""
     try:
-        return checked_history(_with_prefix(_HISTORY, arrays))
+        return checked_history(with_prefix(_HISTORY, arrays))
     except ValueError as e:
         raise InputError(f"{path}: malformed history: {e}") from None
 
 
-def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
+def with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
     """Return the arrays whose names have a prefix, by name without the prefix."""
     return {
         name.removeprefix(prefix): values

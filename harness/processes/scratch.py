@@ -8,25 +8,41 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 
+from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.locks import file_lock
+from mortarbench.harness.processes.solver_file import write_solver
 from mortarbench.harness.processes.supervisor import WorkerProcess
 
 _SCRATCH = "mortarbench-tmp-"
 
 
 @contextmanager
-def single_worker(command: list[str]) -> Iterator[WorkerProcess]:
-    """Start a worker for one measurement; the worker ends with the context.
+def single_worker(
+    command: Callable[[Path | None], list[str]], solver: Solver | None = None
+) -> Iterator[WorkerProcess]:
+    """Start a worker for one solver; the worker ends with the context.
 
-    command : starts the worker; two file descriptors are appended
+    command : returns the command that starts the worker, without file descriptors; its
+        argument is the file with the copy of `solver`
+    solver : solver to copy into the worker; None if the command names the solver
+
+    Raises
+    ------
+    InputError
+        If the solver cannot be copied.
+
     """
     with scratch_folder() as scratch:
-        worker = WorkerProcess(command, scratch / "worker.log")
+        copy = None
+        if solver is not None:
+            copy = scratch / "solver.pickle"
+            write_solver(copy, solver)
+        worker = WorkerProcess(command(copy), scratch / "worker.log")
         try:
             worker.start()
             yield worker

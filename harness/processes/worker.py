@@ -5,7 +5,6 @@ The process follows `harness.processes.protocol` and answers these requests:
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
   the point to ``out``. Optional entries are
 
-  - ``digest``: digest of the file, which is checked,
   - ``memory_limit``: limit in MiB,
   - ``once``: true for a single solve, which is timed, and
   - ``step``: index 0, 1, … of the QP in a sequence
@@ -40,7 +39,6 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
@@ -104,8 +102,6 @@ class Worker:
     ranks: Ranks | None = None
     _chain: Prepare | None = None  # solver of the current sequence
     _last_step: int = -1  # index of the last measured step of the sequence
-    # digest, inode, size and modification time of each verified file
-    _verified_files: set[tuple[Any, ...]] = field(default_factory=set)
     _ballast: Any = None  # array that shifts the addresses of other arrays
 
     def answer(self, request: dict[str, Any], send: Send) -> Mapping[str, Any]:
@@ -171,7 +167,7 @@ class Worker:
             solver, qp = ranks.problem(solver)
             set_limit = partial(ranks.call, "limit")
         else:
-            qp = self._load(request)
+            qp, _ = load_qp(Path(request["qp"]), operators=self.operators)
         set_limit(request.get("memory_limit"))
         timed = measure(
             solver,
@@ -204,18 +200,6 @@ class Worker:
             "solves": timed.solves,
             "cost": timed.cost,
         }
-
-    def _load(self, request: dict[str, Any]) -> QP:
-        path, digest = Path(request["qp"]), request.get("digest")
-        if digest is not None:
-            status = path.stat()
-            # hash the file again only if inode, size or time have changed
-            version = (digest, status.st_ino, status.st_size, status.st_mtime_ns)
-            if version not in self._verified_files:
-                if content_digest(path) != digest:
-                    raise ValueError(f"{path.name} was changed on disk")
-                self._verified_files.add(version)
-        return load_qp(path, operators=self.operators)[0]
 
     def _step(self, request: dict[str, Any]) -> Prepare | None:
         """Return the `prepare` function of a step; step 0 begins a new sequence.

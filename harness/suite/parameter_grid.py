@@ -211,41 +211,35 @@ def _axes(
     An axis is a list of dicts from keys to values. Keys that are zipped belong to the
     axis of the first of them; any other key has its own axis.
     """
-    lists = [key for key, value in params.items() if isinstance(value, list)]
-    zipped: dict[str, Sequence[str]] = {}
+    lists = {key: value for key, value in params.items() if isinstance(value, list)}
+    keys = [key for group in problem.zip for key in group]
+    for key in keys:
+        if key not in lists or keys.count(key) > 1:
+            raise InputError(
+                f"zip: {shown(key)} is not a list in params, or is paired twice; "
+                'expected groups of such keys, like [["Nr", "Nh"]]'
+            )
     for group in problem.zip:
-        for key in group:
-            if key not in lists or key in zipped:
-                raise InputError(
-                    f"zip: {shown(key)} is not a list in params, or is paired twice; "
-                    'expected groups of such keys, like [["Nr", "Nh"]]'
-                )
-            zipped[key] = group
-        if len({len(params[key]) for key in group}) > 1:
-            lengths = ", ".join(f"{key} has {len(params[key])}" for key in group)
+        if len({len(lists[key]) for key in group}) > 1:
+            lengths = ", ".join(f"{key} has {len(lists[key])}" for key in group)
             raise InputError(f"zip: {lengths} values; expected lists of equal length")
     sequence = problem.sequence
-    if sequence is not None and (sequence not in lists or len(params[sequence]) < 2):
+    if sequence is not None and len(lists.get(sequence, ())) < 2:
         hint = f"; the lists are {some(lists)}" if lists else ""
         raise InputError(
             f"sequence = {shown(sequence)} is not a list in params; expected the key "
             f"whose values are the steps{hint}"
         )
-    axes: list[list[dict[str, Any]]] = []
-    steps, done = None, set[str]()
+    axes: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for key in params:
-        if key in done:
-            continue
-        together = zipped.get(key, (key,))
-        done.update(together)
-        if sequence in together:
-            steps = len(axes)
-        columns = [params[k] if k in lists else [params[k]] for k in together]
+        together = next((group for group in problem.zip if key in group), (key,))
+        columns = [lists.get(k, [params[k]]) for k in together]
         if not columns[0]:
             raise InputError(f"params.{key} is empty; expected at least one entry")
         rows = zip(*columns, strict=True)
-        axes.append([dict(zip(together, row, strict=True)) for row in rows])
-    return axes, steps
+        axes[together] = [dict(zip(together, row, strict=True)) for row in rows]
+    steps = [number for number, group in enumerate(axes) if sequence in group]
+    return [*axes.values()], steps[0] if steps else None
 
 
 def _expanded(paths: object, folder: Path, family: Family) -> object:

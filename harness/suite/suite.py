@@ -183,8 +183,7 @@ def as_toml(table: Mapping[str, Any]) -> str:
     tolerances = [1e-06]
 
     """
-    lines = [f"{_key(k)} = {_value(str(k), v)}" for k, v in table.items()]
-    return "\n".join(lines) + "\n"
+    return "".join(f"{_key(k)} = {_value(str(k), v)}\n" for k, v in table.items())
 
 
 def _key(key: object) -> str:
@@ -201,22 +200,20 @@ def _value(where: str, value: Any) -> str:
     if hasattr(value, "tolist"):
         value = value.tolist()
     match value:
-        case bool():  # before int, since bool is a subclass of int
-            return str(value).lower()
-        case int() | float():
-            return repr(value)
         # JSON strings are valid TOML strings except in two cases, which are avoided
         # here: JSON does not escape DEL, and its ASCII form splits characters beyond 16
         # bits into surrogate pairs.
         case str() | Path():
             return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+        case bool() | int() | float():
+            return repr(value).lower()
         case Mapping():
-            pairs = [
+            pairs = (
                 f"{_key(k)} = {_value(f'{where}.{k}', v)}" for k, v in value.items()
-            ]
-            return f"{{ {', '.join(pairs)} }}" if pairs else "{}"
+            )
+            return f"{{ {', '.join(pairs)} }}"
         case list() | tuple() | range():
-            entries = [_value(f"{where}[{i}]", v) for i, v in enumerate(value)]
+            entries = (_value(f"{where}[{i}]", v) for i, v in enumerate(value))
             return f"[{', '.join(entries)}]"
     raise InputError(
         f"{where} = {shown(value)}; expected a string, a number, true or false, a "

@@ -28,7 +28,7 @@ def validate(registries: Registries, *, json: bool = False, **arguments: Any) ->
 
 
 def report(
-    registries: Registries,
+    _: Registries,
     folder: str,
     others: Sequence[str] = (),
     *,
@@ -43,7 +43,7 @@ def report(
     verbose : print the paths of all written files, not only the path of the page
     json : print JSON
     """
-    result = mb.report(folder, *others, **arguments, registries=registries)
+    result = mb.report(folder, *others, **arguments)
     if json:
         print(dumps(result.to_dict(), allow_nan=False))
     else:

@@ -44,7 +44,7 @@ def run(
         print(measured)
     written = mb.Report(files=())
     if measured.records:
-        written = mb.report(measured.folder, registries=registries)
+        written = mb.report(measured.folder)
     pages = [file for file in written.files if file.suffix == ".html"]
     failed = _strict_failure(measured) if strict else ""
     if json:
@@ -58,18 +58,13 @@ def run(
 
 def _strict_failure(measured: mb.Results) -> str:
     """Return the reason why a strict run fails, in one line; "" if it does not fail."""
-    counts = (
-        (measured.refuted, "refuted claim", "refuted claims"),
-        (
-            measured.failed,
-            "measurement without an answer",
-            "measurements without an answer",
-        ),
-    )
     texts = [
-        f"{len(records)} {one if len(records) == 1 else several} "
+        f"{len(records)} {what} "
         f"({some(dict.fromkeys(f'{r.solver} on {r.case}' for r in records))})"
-        for records, one, several in counts
+        for records, what in (
+            (measured.refuted, "refuted"),
+            (measured.failed, "without an answer"),
+        )
         if records
     ]
-    return f"strict: {' and '.join(texts)}" if texts else ""
+    return f"strict: measurements: {' and '.join(texts)}" if texts else ""

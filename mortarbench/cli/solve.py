@@ -53,7 +53,10 @@ def solve(
     files = {"plot": plot, "vtu": vtu, "out": out}
     _check_files(files, scale)
     check_name(solver, registries.solvers)
-    options = {key: _only(key, values) for key, values in parse_options(option).items()}
+    options = {
+        key: values[0] if len(values) == 1 else values
+        for key, values in parse_options(option).items()
+    }
     problem: str | mb.Case = case
     pictures = [f"--{name}" for name in ("plot", "vtu") if files[name] is not None]
     if pictures:
@@ -74,16 +77,6 @@ def solve(
     else:
         _write(answer, **files, scale=scale)
     return 0 if answer.verdict.is_verified else 1
-
-
-def _only(key: str, values: Sequence[str]) -> str:
-    """Return the only value of an option; raise InputError if there are several."""
-    if len(values) > 1:
-        raise InputError(
-            f"--option: {key} has {len(values)} values; expected one value, since "
-            "only `run` measures several"
-        )
-    return values[0]
 
 
 def _check_files(files: Mapping[str, str | None], scale: float | None) -> None:

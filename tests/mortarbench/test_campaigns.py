@@ -342,8 +342,8 @@ def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
     code, out, _ = cli(*asked, "--strict")
     assert code == 1
     assert out.splitlines()[-1] == (
-        "strict: 1 refuted claim (liar on well/depth=2/dual) and 1 measurement "
-        "without an answer (lost on well/depth=2/dual)"
+        "strict: measurements: 1 refuted (liar on well/depth=2/dual) and 1 without an "
+        "answer (lost on well/depth=2/dual)"
     )
     good = (*asked, "--solver", "exact", "--solver", "picky")
     assert (

@@ -72,10 +72,8 @@ def test_a_suite_refuses_solver_objects(tmp_path, solvers):
     for arguments in ({"suite": "demo", "solvers": solvers}, {"suite": suite}):
         with pytest.raises(mb.InputError) as refused:
             mb.run(**arguments, out=tmp_path / "out")
-        assert str(refused.value) == (
-            "a suite cannot contain solver objects, only names; pass "
-            "plugins=['FILE.py'] and name the solver"
-        )
+        assert "solvers" in str(refused.value)
+        assert "; expected a" in str(refused.value)
     assert not (tmp_path / "out").exists()
 
 

@@ -16,7 +16,6 @@ import pytest
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.errors import FaultError
-from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import supervisor
@@ -143,10 +142,9 @@ class Bench:
             CASE, SolverSpec(name=solver, label=solver),
             options={}, tol=1e-6, repeat=0, environment="",
         ).replace(qp=self.digest)  # fmt: skip
-        file = self.folder / "qp.npz"
         return measure_and_judge(
             self.workers[solver], lambda: self.qp, record,
-            out=self.folder / "point.npz", qp_file=(file, content_digest(file)),
+            out=self.folder / "point.npz", qp_file=self.folder / "qp.npz",
             time_limit=time_limit, memory_limit=self.memory_limit,
         )[0]  # fmt: skip
 
