@@ -101,13 +101,9 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     """
     head = family_name(text, families)
     family = families[head]
-    if (suffix := family.path_suffix) is None:
-        parts, given = text.split("/")[1:], {}
-    else:
-        path, parts = _split_path(text, head, family, suffix)
-        given = {"path": path}
-        if not suffix:
-            return assemble(head, family, given, family.forms[0], texts=True)
+    parts, given = text.split("/")[1:], {}
+    if family.path_suffix is not None:
+        given["path"], parts = _split_path(text, head, family)
     if not parts or "=" in parts[-1]:
         forms = ", ".join(family.forms)
         raise InputError(
@@ -265,28 +261,22 @@ def match(pattern: str, names: Iterable[str]) -> list[str]:
     return [name for name in names if fnmatchcase(name, pattern)]
 
 
-def _split_path(
-    text: str, head: str, family: Family, suffix: str
-) -> tuple[str, list[str]]:
+def _split_path(text: str, head: str, family: Family) -> tuple[str, list[str]]:
     """Split the text after ``FAMILY:`` into the path and the other components.
 
     If the family has a single form and the form is missing, the form is added.
     """
-    path = text[len(head) + 1 :]
+    path, parts, suffix = text[len(head) + 1 :], list[str](), family.path_suffix
+    if suffix:
+        parts = path.split("/")
+        end = next((i for i, p in enumerate(parts, 1) if p.endswith(suffix)), 0)
+        path, parts = "/".join(parts[:end]), parts[end:]
     if text[len(head) : len(head) + 1] != ":" or not path:
-        raise InputError(
-            f"{shortened(text)}: the path is missing; expected {head}:PATH{suffix}"
-        )
-    if not suffix:
-        return path, []
-    parts = path.split("/")
-    ends = [i for i, part in enumerate(parts, 1) if part.endswith(suffix)]
-    if not ends:
+        rest = "/…/FORM" if len(family.forms) > 1 else ""
         raise InputError(
             f"{shortened(text)}: the path is missing; expected "
-            f"{head}:PATH{suffix}/…/FORM"
+            f"{head}:PATH{suffix}{rest}"
         )
-    path, parts = "/".join(parts[: ends[0]]), parts[ends[0] :]
     if len(family.forms) == 1 and (not parts or "=" in parts[-1]):
         parts.append(family.forms[0])
     return path, parts

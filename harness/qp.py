@@ -14,7 +14,7 @@ from scipy.sparse import coo_array, csc_array, issparse, tril, triu
 from mortarbench.harness.errors import InputError, shortened, shown
 from mortarbench.harness.sets.blocks import Blocks
 from mortarbench.harness.sets.box import Box
-from mortarbench.harness.sets.convex import ConvexSet, hull
+from mortarbench.harness.sets.convex import ConvexSet, hull, numeric_array
 from mortarbench.harness.sets.convex import Vector as Vector
 from mortarbench.harness.sets.discs import Discs
 
@@ -512,29 +512,6 @@ def canonical(M: Matrix) -> Matrix:
     return M
 
 
-def _numbers(name: str, value: Any) -> NDArray[np.float64]:
-    """Return a dense copy of an array of real numbers, which may contain inf and NaN.
-
-    Raises
-    ------
-    InputError
-        If `value` is None, ragged or not numeric.
-
-    """
-    expected = "expected an array of numbers"
-    if value is None:
-        raise InputError(f"{name} is missing; {expected}")
-    try:
-        array = np.asarray(value.toarray() if issparse(value) else value)
-    except ValueError:  # rows of different lengths
-        raise InputError(f"{name} is ragged; {expected}") from None
-    if array.dtype.kind not in "biuf":
-        kind = type(value).__name__ if array.dtype.kind == "O" else array.dtype
-        raise InputError(f"{name} is of type {kind}; {expected}")
-    with np.errstate(over="ignore"):  # overflow yields inf, which callers reject
-        return np.array(array, dtype=float)
-
-
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
     """Return a copy of a vector, which may also be a matrix with one row or column.
 
@@ -549,7 +526,7 @@ def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
         If `value` is not numeric or has the wrong shape; NaN and inf are accepted.
 
     """
-    array = _numbers(name, value)
+    array = numeric_array(name, value)
     is_flat = array.ndim == 2 and (1 in array.shape or not array.size)
     vector = array.ravel() if is_flat else array
     if vector.ndim != 1 or (n is not None and vector.size != n):
@@ -565,7 +542,7 @@ def _bound(name: str, value: ArrayLike | None, absent: float, n: int) -> Vector:
     """
     value = absent if value is None else value
     if np.ndim(value) == 0 and not issparse(value):
-        return with_infinities(np.full(n, _numbers(name, value)))
+        return with_infinities(np.full(n, numeric_array(name, value)))
     return with_infinities(numeric_vector(name, value, n))
 
 
@@ -588,7 +565,7 @@ def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
             raise InputError(
                 f"{name} is an operator; expected a matrix: {name} @ np.eye({n})"
             )
-        M = entries = _numbers(name, value)
+        M = entries = numeric_array(name, value)
         M = np.atleast_2d(M) if rows is None else M
     if not np.isfinite(entries).all():
         where = coo_array(M)

@@ -229,22 +229,22 @@ class WorkerProcess:
         oom_kills, sent, elapsed = _oom_kills(), time.monotonic(), None
         self._send(request)
         is_shared, is_timed = source_of(request).is_shared, "out" in request
-        final_limit = time_limit
+        events = [
+            *[("built", time_limit)] * is_shared,
+            ("start", START_SECONDS),
+            *[("solved", time_limit), ("timed", REPEAT_SECONDS)] * is_timed,
+            *[("measured", POINT_SECONDS)] * is_shared,
+        ]
         try:
-            if is_shared:
-                self._built = self._await("built", time_limit, memory_limit)
-            self._await("start", START_SECONDS, memory_limit)
-            if is_timed:
-                self._await("solved", time_limit, memory_limit)
-                self._await("timed", REPEAT_SECONDS, memory_limit)
-                elapsed = time.monotonic() - sent
-                final_limit = max(time_limit, POINT_SECONDS)
-            if is_shared:
-                self._await("measured", POINT_SECONDS, memory_limit)
+            for event, limit in events:
+                entries = self._await(event, limit, memory_limit)
+                if event == "built":
+                    self._built = entries
+                elif event == "timed":
+                    elapsed = time.monotonic() - sent
+            limit = max(time_limit, POINT_SECONDS) if is_timed else time_limit
             # the memory of the evaluation does not count
-            answer = self._await(
-                "done", final_limit, None if is_shared else memory_limit
-            )
+            answer = self._await("done", limit, None if is_shared else memory_limit)
         except _WorkerEndError as end:
             end.is_oom = end.signal == "SIGKILL" and _oom_kills() > oom_kills
             if is_shared:

@@ -131,23 +131,21 @@ class Executor:
         count = len(self._entries) if source.needs_case else len(turn)
         ended: Record | None = None
         for step, record in enumerate(turn):
+            reason = ""
             if step >= count:
-                status, message = Verdict.DECLINED, self._end_reason
-                yield Result(record=record.replace(status=status, message=message))
+                status, reason = Verdict.DECLINED, self._end_reason
             elif ended is not None:
-                message = f"the sequence ended at {ended.case}: {ended.message}"
                 status = ended.status
-                yield Result(record=record.replace(status=status, message=message))
-            else:
-                result = self._measure(block, turn, step, source)
-                # a failed step loses the solver's data for later steps
-                if (
-                    block.is_sequence
-                    and result.point is None
-                    and result.record.status is not Verdict.DECLINED
-                ):
-                    ended = result.record
-                yield result
+                reason = f"the sequence ended at {ended.case}: {ended.message}"
+            if reason:
+                yield Result(record=record.replace(status=status, message=reason))
+                continue
+            result = self._measure(block, turn, step, source)
+            # a failed step loses the solver's data for later steps
+            failed = result.record.status is not Verdict.DECLINED
+            if block.is_sequence and result.point is None and failed:
+                ended = result.record
+            yield result
         if block.is_sequence and source.is_shared:
             self._worker(turn[0].solver).close()  # it remains between steps only
 

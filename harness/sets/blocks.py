@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from mortarbench.harness.errors import InputError, shown
-from mortarbench.harness.sets.convex import Vector
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.sets.convex import Vector, numeric_array
 
 
 class Blocks(ABC):
@@ -39,7 +39,10 @@ class Blocks(ABC):
 
         """
         kind, size = type(self).__name__, fields(self)[1].name  # type: ignore[arg-type]
-        index, sizes = _numbers(self, "index"), _numbers(self, size)
+        index, sizes = (
+            numeric_array(f"{kind}: {name}", getattr(self, name))
+            for name in ("index", size)
+        )
         if index.ndim != 2 or index.shape[1] < self.least:
             raise InputError(
                 f"{kind}: index has shape {index.shape}; expected (k, {self.columns}), "
@@ -62,7 +65,7 @@ class Blocks(ABC):
                 "nonnegative numbers"
             )
         object.__setattr__(self, "index", whole)
-        object.__setattr__(self, size, sizes.astype(float))
+        object.__setattr__(self, size, sizes)
 
     @property
     def block(self) -> NDArray[np.int64]:
@@ -118,18 +121,3 @@ class Blocks(ABC):
 def norms(blocks: NDArray[Any]) -> NDArray[Any]:
     """Return the Euclidean norms (k,) of rows (k, d), without a change of precision."""
     return np.asarray(np.linalg.norm(blocks, axis=1))
-
-
-def _numbers(one: Blocks, name: str) -> NDArray[Any]:
-    """Check that the field `name` is an array of numbers, and return a copy."""
-    value = getattr(one, name)
-    try:
-        array = np.array(value)
-    except ValueError:  # rows of different lengths
-        array = np.array(None)
-    if array.dtype.kind not in "iuf":
-        raise InputError(
-            f"{type(one).__name__}: {name} = {shown(value)}; expected an array of "
-            "numbers"
-        )
-    return array

@@ -43,18 +43,17 @@ class Box:
 
     def check(self, n: int) -> None:
         """Raise ValueError if bounds have a wrong shape, are NaN or exclude all x."""
-        for name, bound in (("lb", self.lower), ("ub", self.upper)):
+        for name, bound, excluded, expected in (
+            ("lb", self.lower, np.inf, "below inf"),
+            ("ub", self.upper, -np.inf, "above -inf"),
+        ):
             if bound.shape != (n,):
                 raise ValueError(f"QP.{name} has shape {bound.shape}, expected {(n,)}")
-        for name, bound, is_valid, expected in (
-            ("lb", self.lower, self.lower < np.inf, "below inf"),
-            ("ub", self.upper, self.upper > -np.inf, "above -inf"),
-        ):
-            if not is_valid.all():
-                i = int(np.asarray(is_valid).argmin())
-                value = np.asarray(bound)[i]
+            wrong = np.asarray(np.isnan(bound) | (bound == excluded))
+            if wrong.any():
+                i = int(wrong.argmax())
                 raise ValueError(
-                    f"{name}[{i}] is {value:g}; expected a number {expected}"
+                    f"{name}[{i}] is {bound[i]:g}; expected a number {expected}"
                 )
         if (self.lower > self.upper).any():
             lower, upper = np.asarray(self.lower), np.asarray(self.upper)

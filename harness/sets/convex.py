@@ -19,6 +19,9 @@ from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import issparse
+
+from mortarbench.harness.errors import InputError
 
 Vector = NDArray[np.float64]
 S = TypeVar("S", bound="ConvexSet")
@@ -78,6 +81,29 @@ class ConvexSet(Protocol):
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays that define the set, keyed by their names in files."""
+
+
+def numeric_array(name: str, value: Any) -> NDArray[np.float64]:
+    """Return a dense copy of an array of real numbers, which may contain inf and NaN.
+
+    Raises
+    ------
+    InputError
+        If `value` is None, ragged or not numeric.
+
+    """
+    expected = "expected an array of numbers"
+    if value is None:
+        raise InputError(f"{name} is missing; {expected}")
+    try:
+        array = np.asarray(value.toarray() if issparse(value) else value)
+    except ValueError:  # rows of different lengths
+        raise InputError(f"{name} is ragged; {expected}") from None
+    if array.dtype.kind not in "biuf":
+        kind = type(value).__name__ if array.dtype.kind == "O" else array.dtype
+        raise InputError(f"{name} is of type {kind}; {expected}")
+    with np.errstate(over="ignore"):  # overflow yields inf, which callers reject
+        return np.array(array, dtype=float)
 
 
 def hull(sets: Sequence[ConvexSet], n: int) -> tuple[Vector, Vector]:
