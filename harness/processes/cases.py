@@ -3,7 +3,8 @@
 The requests and their answers are:
 
 * ``{"build": NAME, "qp": PATH, "keep": N}`` builds the case and writes its QP to PATH.
-  Answer: ``{"meta": {…}}``, which includes a digest of the coefficients of the QP
+  Answer: ``{"meta": {…}}``, the fields ``qp``, ``build_seconds`` and
+  ``dualise_seconds`` of the record
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates the
   point in the file ``point``. Answer: ``{"quantities": {…}, "bounds": {…}, "notes":
   […], "seconds": …}``, with the physical quantities of the point, the bounds on its
@@ -39,7 +40,7 @@ from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
-from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
+from mortarbench.harness.verify.verdicts import certified, note_of, quantities_of
 
 MAX_STORED_BOUNDS = 10_000  #: largest number of points whose error bounds are cached
 #: The first dual case of a process is built again if its build took less than this
@@ -147,15 +148,10 @@ class Cases:
         return case
 
     def _write(self, case: Case, name: CaseId, path: Path) -> dict[str, Any]:
+        saved = save_qp(path, case.qp, {"name": name.name}, serialised=True)
         meta = {
-            "name": name.name,
-            "scale": case.scale,
-            "constant": case.constant,
-        }
-        saved = save_qp(path, case.qp, plain(meta), serialised=True)
-        digest = case.digest or saved
-        seconds = {
+            "qp": case.digest or saved,
             "build_seconds": self._build_seconds,
             "dualise_seconds": case.dualise_seconds,
         }
-        return {"meta": {**meta, **seconds, "qp": digest}}
+        return {"meta": meta}

@@ -32,7 +32,6 @@ class Commands:
 class WorkUnit:
     """A block: the remaining measurements of all solvers on one case or sequence."""
 
-    number: int
     #: incomplete records of each solver, in the order of measurement: one record for a
     #: case, or one record for each step of a sequence
     turns: tuple[tuple[Record, ...], ...]

@@ -35,7 +35,7 @@ class BuiltCase(NamedTuple):
     """Case that the case worker has built."""
 
     file: Path  #: file that contains the QP, see `harness.files.qpfile`
-    meta: Mapping[str, Any]  #: meta data of the QP, see `harness.processes.cases`
+    meta: Mapping[str, Any]  #: fields of records, see `harness.processes.cases`
     qp: QP
 
 
@@ -159,8 +159,7 @@ class Executor:
             entries["once"] = True
         if source.needs_case:
             built = self._entries[step]
-            keys = ("qp", "build_seconds", "dualise_seconds")
-            record = record.replace(**{key: built.meta.get(key) for key in keys})
+            record = record.replace(**built.meta)
             qp_file = None if source.is_shared else built.file
         record, solution = measure_and_judge(
             self._worker(record.solver),

@@ -149,7 +149,6 @@ class Schedule:
             turns.reverse()
         self._next += 1
         return WorkUnit(
-            number=turns[0][0].block,
             turns=tuple(turns),
             time_limit=self.suite.file.time_limit,
             memory_limit=self.suite.file.memory_limit,

@@ -89,7 +89,9 @@ def test_options_are_passed_on_and_history_can_be_switched_off():
 
     assert few.verdict is Verdict.ITERATION_LIMIT
     assert few.record.options["max_steps"] == 3
-    assert "solver                    smalbe (max_steps=3, history=False)\n" in repr(few)
+    assert "solver                    smalbe (max_steps=3, history=False)\n" in repr(
+        few
+    )
     assert few.history == {}
     with pytest.raises(mb.InputError, match="smalbe: unknown option 'max_step'"):
         mb.solve(case, "smalbe", options={"max_step": 3})
