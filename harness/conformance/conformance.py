@@ -10,8 +10,6 @@ would fail.
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from enum import StrEnum
@@ -261,27 +259,6 @@ def _many_bounds_and_no_rows(solver: Solver) -> None:
     _solved(solver, membrane(20), 1e-6, VERIFIED_FACTOR)
 
 
-def _runs_in_one_thread(solver: Solver) -> None:
-    """Require that a solve uses one thread: CPU time is at most about the wall time."""
-    qp, _ = manufactured("everything", n=300, dense=True)
-    allowed = os.sched_getaffinity(0)
-    # permit all CPUs, because on a single CPU the CPU time of two threads would not
-    # exceed the wall time
-    os.sched_setaffinity(0, range(os.cpu_count() or 1))
-    try:
-        used, passed = time.process_time(), time.perf_counter()
-        s = _solve(solver, qp, 1e-6)
-        used, passed = time.process_time() - used, time.perf_counter() - passed
-    finally:
-        os.sched_setaffinity(0, allowed)
-    if s.status is not Status.SOLVED:
-        raise ContractError(f"ended as {s.status}: {s.message}")
-    if used > 1.2 * passed + 0.02:
-        raise ContractError(
-            f"used {used:.2f} s of CPU time in {passed:.2f} s; expected one thread"
-        )
-
-
 def _a_sequence_is_solved(solver: Solver) -> None:
     """Require correct solutions of the QPs of `_sequence`, solved as a sequence."""
     prepare = _chained(solver)
@@ -395,7 +372,6 @@ CHECKS: Mapping[str, Check] = {
     "claims no success: infeasible": partial(_claims_no_success, infeasible),
     "claims no success: unbounded": partial(_claims_no_success, unbounded),
     "takes or declines an operator": _an_operator_is_taken_or_declined,
-    "computes in one thread": _runs_in_one_thread,
     "solves a sequence": _a_sequence_is_solved,
     **{
         f"{INVARIANCE_PREFIX}: {form}, {change}": partial(

@@ -211,12 +211,6 @@ class StopsAtTheStart(Sound):
         return replace(s, x=qp.lb) if qp.q.size == 400 else s
 
 
-class Slow(Sound):
-    def act(self, qp, tol):
-        time.sleep(0.1)
-        return self.honest(qp, tol)
-
-
 class MindsUnits(Sound):
     """Solver that fails for large numbers, as with an absolute tolerance."""
 
