@@ -2,7 +2,8 @@
 
 The values of each array are aligned to 64 bytes. Behind them, the file ends with a JSON
 list of (name, dtype, shape, offset) and with the offset of this list as 8 bytes. Mapped
-values are in the page cache, which all processes share. The content is not checked.
+values are in the page cache, which all processes share. The content is not checked, so
+the digest of a file has to be checked before it is mapped.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ from __future__ import annotations
 import json
 import mmap
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.files.durable import replacing
 
 #: size of a cache line in bytes; misaligned arrays would affect measured times
@@ -37,6 +40,21 @@ def write_mapped(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             file.write(array.tobytes())
         end = file.tell().to_bytes(_OFFSET_BYTES, "little")
         file.write(json.dumps(entries).encode() + end)
+
+
+def content_digest(path: Path) -> str:
+    """Return 24 hex digits of the SHA-256 of a file's content.
+
+    The file is read again only if its inode, size or time have changed.
+    """
+    status = path.stat()
+    return _digest(path, status.st_ino, status.st_size, status.st_mtime_ns)
+
+
+@cache
+def _digest(path: Path, *_version: int) -> str:
+    with path.open("rb") as file:
+        return hex_digest(pieces(file), 24)
 
 
 def read_mapped(path: Path) -> dict[str, NDArray[Any]]:

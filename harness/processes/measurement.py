@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness.errors import FaultError, InputError
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.files.store import read_point
 from mortarbench.harness.plugin import Case, Reference
@@ -41,7 +42,7 @@ def measure_and_judge(
     *,
     out: Path,
     source: Source = Source.FILE,
-    qp_file: Path | None = None,
+    qp_file: tuple[Path, str] | None = None,
     time_limit: float,
     memory_limit: float = inf,
     **entries: Any,
@@ -55,7 +56,7 @@ def measure_and_judge(
     out : file to which the worker writes the point
     source : origin of the QP. Unless `Source.needs_case`, the worker judges the answer,
         and computes its quantities and error bounds
-    qp_file : file with the QP; None if ranks build the QP
+    qp_file : file with the QP, and digest of its content; None if ranks build the QP
     time_limit, memory_limit : limits in s and MiB
     entries : further entries of the request, see `harness.processes.worker`
 
@@ -76,7 +77,7 @@ def measure_and_judge(
     if qp_file is None:
         request["case"] = case_entry(record)
     else:
-        request["qp"] = str(qp_file)
+        request |= {"qp": str(qp_file[0]), "digest": qp_file[1]}
     if not isinf(memory_limit):
         request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
@@ -196,10 +197,12 @@ def measure_once(
 
     """
     with scratch_folder() as scratch:
-        path = scratch / "qp.npz"
+        path, qp_file = scratch / "qp.npz", None
         if source.needs_case:
             saved = save_qp(path, case().qp, {"name": record.case}, serialised=True)
             record = record.replace(qp=case().digest or saved)
+        if not source.is_shared:
+            qp_file = path, content_digest(path)
         once = partial(
             measure_and_judge,
             worker,
@@ -207,7 +210,7 @@ def measure_once(
             record,
             out=scratch / "point.npz",
             source=source,
-            qp_file=None if source.is_shared else path,
+            qp_file=qp_file,
             time_limit=time_limit,
         )
         try:

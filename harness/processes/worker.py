@@ -2,8 +2,9 @@
 
 The process follows `harness.processes.protocol` and answers these requests:
 
-* ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
-  the point to ``out``. Optional entries are
+* ``{"qp": PATH, "digest": DIGEST, "tol": TOL, "out": PATH}``: map the QP into memory
+  after a check of the file's digest, measure, and write the point to ``out``. Optional
+  entries are
 
   - ``memory_limit``: limit in MiB,
   - ``once``: true for a single solve, which is timed, and
@@ -39,6 +40,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
@@ -167,7 +169,10 @@ class Worker:
             solver, qp = ranks.problem(solver)
             set_limit = partial(ranks.call, "limit")
         else:
-            qp, _ = load_qp(Path(request["qp"]), operators=self.operators)
+            path = Path(request["qp"])
+            if content_digest(path) != request["digest"]:
+                raise ValueError(f"{path.name}: was changed on disk")
+            qp, _ = load_qp(path, operators=self.operators)
         set_limit(request.get("memory_limit"))
         timed = measure(
             solver,

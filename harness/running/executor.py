@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from mortarbench.harness.errors import FaultError, described
 from mortarbench.harness.files.durable import refuse_full_disk, report_full_disk
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays
 from mortarbench.harness.operators import NO_MAKERS, Maker
@@ -34,7 +35,8 @@ from mortarbench.harness.verify.verdicts import has_point, noted
 class BuiltCase(NamedTuple):
     """Case that the case worker has built."""
 
-    file: Path  #: file that contains the QP, see `harness.files.qpfile`
+    #: file that contains the QP (`harness.files.qpfile`), and digest of its content
+    file: tuple[Path, str]
     meta: Mapping[str, Any]  #: fields of records, see `harness.processes.cases`
     qp: QP
 
@@ -195,7 +197,7 @@ class Executor:
             try:
                 meta = self._ask_case_worker(request)["meta"]
                 qp, _ = load_qp(path, operators=self.operators)
-                entries.append(BuiltCase(path, meta, qp))
+                entries.append(BuiltCase((path, content_digest(path)), meta, qp))
             except _BuildError as e:
                 if not entries or not e.past_end:
                     raise

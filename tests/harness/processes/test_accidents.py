@@ -16,6 +16,7 @@ import pytest
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.errors import FaultError
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import supervisor
@@ -132,6 +133,7 @@ class Bench:
         self.folder, self.workers = folder, {}
         self.qp = TINY.build("plain", None).qp
         self.digest = save_qp(folder / "qp.npz", self.qp, serialised=True)
+        self.file_digest = content_digest(folder / "qp.npz")
         self.memory_limit = memory_limit
 
     def __call__(self, solver, *, command=None, time_limit=30.0):
@@ -142,9 +144,10 @@ class Bench:
             CASE, SolverSpec(name=solver, label=solver),
             options={}, tol=1e-6, repeat=0, environment="",
         ).replace(qp=self.digest)  # fmt: skip
+        file = self.folder / "qp.npz"
         return measure_and_judge(
             self.workers[solver], lambda: self.qp, record,
-            out=self.folder / "point.npz", qp_file=self.folder / "qp.npz",
+            out=self.folder / "point.npz", qp_file=(file, self.file_digest),
             time_limit=time_limit, memory_limit=self.memory_limit,
         )[0]  # fmt: skip
 
@@ -334,9 +337,12 @@ def test_a_log_that_cannot_be_written_is_a_fault(bench, tmp_path):
 
 def test_a_qp_that_changed_on_disk_is_a_fault(bench):
     bench("honest")
-    (bench.folder / "qp.npz").write_bytes(b"something else")
+    file = bench.folder / "qp.npz"
+    content = bytearray(file.read_bytes())
+    content[7] ^= 1  # in a number: the file remains readable
+    file.write_bytes(content)
 
-    with pytest.raises(FaultError, match=r"qp\.npz: "):
+    with pytest.raises(FaultError, match=r"qp\.npz: was changed on disk"):
         bench("honest")
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.environment.cpus import fastest_first
+from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.processes import supervisor
 from mortarbench.harness.processes.parent import descendants
@@ -61,13 +62,17 @@ def ignores_sigterm(process):
     return bool(int(mask.split()[1], 16) & 1 << (signal.SIGTERM - 1))
 
 
+def request_for(qp, out):
+    return {"qp": str(qp), "digest": content_digest(qp), "tol": 1e-6, "out": out}
+
+
 @pytest.fixture
 def ask(tmp_path):
     """Return a function that starts a worker and requests a solve of the tiny QP."""
     tiny = load_plugin(PLUGIN).problems["tiny"]
     qp = tmp_path / "qp.npz"
     save_qp(qp, tiny.build("plain", None).qp, serialised=True)
-    request = {"qp": str(qp), "tol": 1e-6, "out": str(tmp_path / "point.npz")}
+    request = request_for(qp, out=str(tmp_path / "point.npz"))
     workers = {}
 
     def ask(solver, *, start=None, time_limit=30.0, memory_limit=2000.0):
@@ -178,7 +183,7 @@ def test_a_worker_that_cannot_start_states_the_reason(ask):
 def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
     tiny = load_plugin(PLUGIN).problems["tiny"]
     save_qp(tmp_path / "qp.npz", tiny.build("plain", None).qp, serialised=True)
-    request = {"qp": str(tmp_path / "qp.npz"), "tol": 1e-6, "out": "unused"}
+    request = request_for(tmp_path / "qp.npz", out="unused")
     arguments = [command("hangs"), request, str(tmp_path / "log")]
     parent = os.spawnv(
         os.P_NOWAIT,
