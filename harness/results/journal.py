@@ -8,7 +8,7 @@ file and the length of its lines.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import count
 from pathlib import Path
 from typing import Any, Self
@@ -161,27 +161,32 @@ def read_journal(
     return [*records.values()]
 
 
-def refuse_other_solver(
-    where: str, r: Record, method: str | None, options: Mapping[str, Any]
+def check_labels(
+    where: str,
+    records: Iterable[Record],
+    labels: dict[str, tuple[str, Mapping[str, Any]]],
 ) -> None:
-    """Refuse a record whose label now denotes another solver, or other options.
+    """Refuse records whose label denotes another solver, or other options.
 
-    where : folder of the record, for the message
-    method : name of the solver that the label denotes; None for that of the record
+    where : folder of the records, for the message
+    labels : name and options of the solver that each label denotes; a label of
+        `records` that is missing is added
 
     Raises
     ------
     InputError
-        If the solver differs, or an option that both have.
+        If a solver differs, or an option that both have.
 
     """
-    now = {**options, "name": method or r.method}
-    for key, old in {**r.options, "name": r.method}.items():
-        if now.get(key, old) != old:
-            raise InputError(
-                f"{where} contains {r.solver} with {key} = {shown(old)}, now "
-                f"{shown(now[key])}; use a different label for other options"
-            )
+    for r in records:
+        name, options = labels.setdefault(r.solver, (r.method, r.options))
+        now = {**options, "name": name}
+        for key, old in {**r.options, "name": r.method}.items():
+            if now.get(key, old) != old:
+                raise InputError(
+                    f"{where} contains {r.solver} with {key} = {shown(old)}, now "
+                    f"{shown(now[key])}; use a different label for other options"
+                )
 
 
 def _records(path: Path) -> Iterator[tuple[int, Record]]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.files.durable import replace_file, report_full_disk
@@ -28,7 +29,7 @@ from mortarbench.harness.results.folder import (
     refuse_foreign,
     write_json,
 )
-from mortarbench.harness.results.journal import read_journal, refuse_other_solver
+from mortarbench.harness.results.journal import check_labels, read_journal
 from mortarbench.harness.suite.growth import refuse_unequal
 from mortarbench.harness.suite.suite import read_suite
 
@@ -74,7 +75,6 @@ def merge(
             f"{out} contains measurements (journal/{journal.name}); expected a new "
             "folder; choose another --out"
         )
-    _check_labels(journals)
     paths = [path for folder in journals if (path := folder / "suite.toml").exists()]
     suites = [read_suite(path) for path in paths]
     for path, suite in zip(paths, suites, strict=True):
@@ -97,15 +97,6 @@ def merge(
     return merged
 
 
-def _check_labels(journals: Mapping[Path, Sequence[Record]]) -> None:
-    """Raise InputError if a label has different solvers or options in two folders."""
-    labels: dict[str, Record] = {}
-    for folder, records in journals.items():
-        for r in records:
-            first = labels.setdefault(r.solver, r)
-            refuse_other_solver(str(folder), r, first.method, first.options)
-
-
 def _united(
     journals: Mapping[Path, Sequence[Record]], tell: Callable[[str], None]
 ) -> list[Record]:
@@ -114,11 +105,14 @@ def _united(
     Raises
     ------
     InputError
-        If two folders contain different records of the same measurement.
+        If two folders contain different records of the same measurement, or different
+        solvers or options under one label.
 
     """
     united: dict[str, Record] = {}
+    labels: dict[str, tuple[str, Mapping[str, Any]]] = {}
     for folder, records in journals.items():
+        check_labels(str(folder), records, labels)
         before = len(united)
         for r in records:
             if r != united.setdefault(r.identity, r):

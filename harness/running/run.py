@@ -30,8 +30,8 @@ from mortarbench.harness.results.folder import (
 )
 from mortarbench.harness.results.journal import (
     Journal,
+    check_labels,
     read_journal,
-    refuse_other_solver,
 )
 from mortarbench.harness.results.work_unit import (
     BuildFailure,
@@ -221,13 +221,13 @@ def _check_same(
         case, such as the digest of its file, has changed.
 
     """
+    labels = {
+        spec.label: (spec.name, finite(plain(options[spec.label])))
+        for spec in suite.solvers
+    }
+    check_labels(str(out), past, labels)
     cases = {case.name: case.params for case in suite.cases.all}
-    methods = {spec.label: spec.name for spec in suite.solvers}
-    configured = {label: finite(plain(value)) for label, value in options.items()}
     for r in past:
-        refuse_other_solver(
-            str(out), r, methods.get(r.solver), configured.get(r.solver, r.options)
-        )
         params = cases.get(r.case, r.params)
         for key in params.keys() & r.params.keys():
             if r.params[key] != params[key]:
