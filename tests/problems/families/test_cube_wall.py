@@ -2,12 +2,10 @@
 
 from functools import cache
 
-import meshio
 import numpy as np
 import pytest
 
 from mortarbench.harness import certify
-from mortarbench.reports.export.vtu import write_vtu
 from mortarbench.solvers import SOLVERS
 from tests.support.cases import built
 
@@ -73,19 +71,6 @@ def test_pressures_on_the_wall_are_forces_over_the_areas_of_their_nodes():
     assert case.quantities(s)["contacts"]["cube on rigid"][
         "pressed_area"
     ] == pytest.approx(side.length[touching].sum())
-
-
-def test_fields_of_subdomains_are_those_of_a_body_in_space(tmp_path):
-    case, s = solved("n=4/feti=2/dual", "smalbe")
-    write_vtu(case.fields(s), tmp_path / "cube.vtu")
-    grid = meshio.read(tmp_path / "cube.vtu")
-
-    assert [block.type for block in grid.cells] == ["hexahedron"]
-    assert np.unique(grid.cell_data["subdomain"][0]).size == 8
-    assert grid.point_data["displacement"].shape == (125, 3)
-    assert set(grid.point_data) >= {"szz", "syz", "von_mises", "pressure", "gap"}
-    u, whole = grid.point_data["displacement"], solved("n=4/primal", "piqp")
-    assert u.ravel() == pytest.approx(whole[0].recover(whole[1]), abs=1e-10)
 
 
 def test_energies_fall_and_converge_with_smaller_cells():

@@ -803,12 +803,3 @@ def test_friction_can_be_omitted_for_one_pair(described):
     qp = built(f"{name}/friction=coulomb/mu=1/dual-bounds").qp
 
     assert np.isinf(qp.ub).all()
-
-
-def test_the_contact_force_of_one_pair_is_its_force_on_the_master(described):
-    case = built(described() + "/step=1/dual")
-    values = case.quantities(reference_solution(case.qp))
-
-    assert values["contact_force"] == pytest.approx(
-        values["contacts"]["ring on beam"]["force"]["beam"], rel=1e-12
-    )

@@ -1,13 +1,10 @@
 """Solids from gmsh files, compared with exact solutions and decomposed bodies."""
 
-import meshio
 import numpy as np
 import pytest
 
-from mortarbench.cli.main import main
 from mortarbench.harness import InputError
 from mortarbench.problems.families.description import read_bodies
-from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.cases import built
@@ -111,25 +108,6 @@ def test_loads_on_faces_are_spread_by_area(tmp_path):
         arm = x - [0.5, 0.5, 2.0]
         assert abs(np.cross(arm, f).sum(axis=0)).max() <= 1e-9 * 1e6
         assert whole.plane is None
-
-
-def test_pressure_picture_and_grid_are_written(tmp_path, monkeypatch, capsys):
-    solid_blocks(tmp_path, TETRAHEDRA)
-    monkeypatch.chdir(tmp_path)
-    command = "solve bodies:blocks.toml/dual --solver smalbe --plot a.png --vtu a.vtu"
-    assert main(Registries(), command.split()) == 0
-    out = capsys.readouterr().out
-    grid = meshio.read("a.vtu")
-    pressure = grid.point_data["pressure"]
-    pressed = grid.point_data["in_contact"] == 1
-
-    assert "largest pressure 1e+06 Pa" in out
-    assert "contact force             (0, 0, -1000000) N" in out
-    assert {block.type for block in grid.cells} == {"tetra"}
-    assert pressure[pressed] == pytest.approx(PRESSURE, rel=1e-6)
-    assert (grid.points[pressed, 2] == 1).all()
-    assert (tmp_path / "a.png").stat().st_size > 10_000
-    assert "force_z_N" in (tmp_path / "a-upper-on-lower.csv").read_text()
 
 
 @pytest.mark.parametrize(

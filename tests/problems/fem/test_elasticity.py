@@ -31,7 +31,6 @@ from mortarbench.problems.fem.stress import (
     centre_stress,
     gauss_stress,
     recover,
-    von_mises,
 )
 from tests.support.hexahedra import WEDGES, bent, divided
 
@@ -165,19 +164,6 @@ def test_one_layer_of_cells_gets_cell_means():
     nodal = recover(mesh, np.array([[1.0], [3.0]]))
 
     assert nodal.ravel() == pytest.approx([1, 2, 3, 1, 2, 3])
-
-
-@pytest.mark.parametrize(
-    ("stress", "plane", "expected"),
-    [
-        ((5.0, 0, 0), "stress", 5.0),  # uniaxial tension
-        ((0, 0, 2.0), "stress", 2 * np.sqrt(3)),  # pure shear
-        ((3.0, 3.0, 0), "stress", 3.0),  # equibiaxial
-        ((3.0, 3.0, 0), "strain", 3.0 * (1 - 2 * 0.3)),  # σ_z = 1.8
-    ],
-)
-def test_von_mises_of_elementary_states(stress, plane, expected):
-    assert von_mises(np.array(stress), 0.3, plane) == pytest.approx(expected)
 
 
 def test_stress_at_the_gauss_points_of_a_bilinear_field():

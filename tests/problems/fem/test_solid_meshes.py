@@ -6,11 +6,10 @@ import meshio
 import numpy as np
 import pytest
 
-from mortarbench.harness import Fields, InputError
+from mortarbench.harness import InputError
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import Mesh, boundary_facets, box
 from mortarbench.problems.fem.mesh_files.reading import read_msh
-from mortarbench.reports.export.vtu import write_vtu
 from tests.support.gmsh_files import solids22
 from tests.support.hexahedra import TETRAHEDRA, WEDGES, divided
 from tests.support.refusals import refused
@@ -80,16 +79,6 @@ def test_bodies_of_several_kinds_are_degenerate_hexahedra(tmp_path):
     assert {block.kind for block in mesh.blocks} == set(KINDS)
     assert list(named.surfaces) == list(KINDS)
     assert stiffness(mesh, D).trace() == pytest.approx(sum(apart), rel=1e-13)
-    u = np.outer(named.points[:, 2], [0, 0, 1])
-    fields = Fields(
-        points=named.points, cells=named.cells, displacement=u,
-        bodies=np.repeat([0, 1, 2], [len(c) for c in named.surfaces.values()]),
-    )  # fmt: skip
-    write_vtu(fields, tmp_path / "a.vtu")
-    grid = meshio.read(tmp_path / "a.vtu")
-    assert sorted(block.type for block in grid.cells) == sorted(KINDS)
-    for block, numbers in zip(grid.cells, grid.cell_data["body"], strict=True):
-        assert set(numbers.tolist()) == {list(KINDS).index(block.type)}
 
 
 @pytest.mark.parametrize("kind", KINDS)

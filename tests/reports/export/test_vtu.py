@@ -328,14 +328,15 @@ def test_a_series_contains_all_load_steps_up_to_the_requested_one(solve, tmp_pat
 
 def test_solids_are_written_by_cell_type_with_forces_in_newtons(tmp_path):
     corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
-    tetra = [0, 4, 6, 7, 7, 7, 7, 7]  # as a degenerate hexahedron
+    tetra = [0, 4, 6, 7, 7, 7, 7, 7]  # as degenerate hexahedra
+    wedge = [0, 4, 6, 6, 1, 5, 7, 7]
     touching = ContactSide(
         name="cube on wall", nodes=np.arange(4), length=np.full(4, 0.25),
         force=np.tile([0.0, 0, 2], (4, 1)), pressure=np.full(4, 8.0), gap=np.zeros(4),
     )  # fmt: skip
     cube = Fields(
-        points=corners, cells=np.array([tetra, [0, 4, 6, 2, 1, 5, 7, 3]]),
-        bodies=np.array([1, 0]), displacement=corners / 7, contacts=(touching,),
+        points=corners, cells=np.array([tetra, wedge, [0, 4, 6, 2, 1, 5, 7, 3]]),
+        bodies=np.array([1, 2, 0]), displacement=corners / 7, contacts=(touching,),
     )  # fmt: skip
 
     paths = write_vtu(cube, tmp_path / "a.vtu")
@@ -343,9 +344,10 @@ def test_solids_are_written_by_cell_type_with_forces_in_newtons(tmp_path):
     grid = meshio.read(paths[0])
     assert {b.type: b.data.tolist() for b in grid.cells} == {
         "tetra": [tetra[:4]],
+        "wedge": [[0, 4, 6, 1, 5, 7]],
         "hexahedron": [[0, 4, 6, 2, 1, 5, 7, 3]],
     }
-    assert [own.tolist() for own in grid.cell_data["body"]] == [[1], [0]]
+    assert [own.tolist() for own in grid.cell_data["body"]] == [[1], [2], [0]]
     np.testing.assert_array_equal(grid.point_data["displacement"], corners / 7)
     along = pd.read_csv(paths[1])
     assert along[["force_x_N", "force_y_N", "force_z_N"]].sum().tolist() == [0, 0, 8]
