@@ -627,7 +627,7 @@ cdef class MPRGP:
             square = dot(self.phi, self.phi, n)
             trace.append(c"n")
             steps += 1
-        self.patience = steps
+        self.patience = max(steps, 2)  # without CG steps, another step must come next
         self.set.project(self.x, 1.0, d, self.s)
         for i in range(n):
             self.s[i] = self.x[i] - self.s[i]
