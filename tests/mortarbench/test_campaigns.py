@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-from contextlib import suppress
 
 import pytest
 
@@ -12,7 +11,7 @@ import mortarbench as mb
 from mortarbench.cli.main import main
 from mortarbench.harness.files.store import is_stored
 from mortarbench.harness.results.folder import environment_of
-from mortarbench.harness.results.journal import Journal, read_journal
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from mortarbench.reports.answer import rows
 from mortarbench.reports.document import markdown
@@ -468,26 +467,3 @@ def test_a_merge_into_one_of_its_sources_is_refused_in_one_line(
     assert said in err
     assert (contents(a), contents(b)) == before
     assert {path.name for path in tmp_path.iterdir()} == {"a", "b", "link"}
-
-
-def test_an_interrupted_growing_series_continues_without_duplicates(
-    campaign, measure, tmp_path, monkeypatch
-):
-    """The run is interrupted before it writes its fourth line."""
-    shutil.copytree(campaign / "before", tmp_path / "out")
-    append, left = Journal.append, iter(range(3))
-
-    def append_or_end(self, record):
-        if next(left, None) is None:
-            raise KeyboardInterrupt
-        append(self, record)
-
-    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
-        patch.setattr(Journal, "append", append_or_end)
-        measure(solvers='"exact", "lax", "near"')
-    held = read_journal(tmp_path / "out")
-    whole = measure(solvers='"exact", "lax", "near"').records
-
-    assert len(held) == 8 + 3
-    assert len(whole) == len({r.run_id for r in whole}) == 3 * 2 * 2
-    assert list(whole[: len(held)]) == held

@@ -103,10 +103,9 @@ def assert_all_right(found, count):
     assert found["scratch"] == []
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_concurrent_builds_solves_and_runs_in_threads_are_correct(tmp_path, times):
-    found = of_threads(tmp_path, 3, times, "solve", "build", "run")
-    assert_all_right(found, 3 * times)
+def test_concurrent_builds_solves_and_runs_in_threads_are_correct(tmp_path):
+    found = of_threads(tmp_path, 3, 1, "solve", "build", "run")
+    assert_all_right(found, 3)
 
 
 @pytest.fixture
@@ -168,14 +167,8 @@ def test_a_fork_does_not_wait_for_a_thread_of_its_parent():
     assert os.waitpid(child, 0)[1] == 0
 
 
-@pytest.mark.parametrize(
-    "closed",
-    [
-        "<&- >&- 2>&-",
-        *(pytest.param(c, marks=pytest.mark.slow) for c in ("<&-", ">&-", "2>&-")),
-    ],
-)
-def test_closed_standard_streams_do_not_affect_answers(tmp_path, closed):
+def test_closed_standard_streams_do_not_affect_answers(tmp_path):
+    closed = "<&- >&- 2>&-"
     solve = f"{sys.executable} -m mortarbench solve {CASE} --solver smalbe {closed}"
     library = (
         "import mortarbench as mb; from pathlib import Path; "
@@ -193,13 +186,7 @@ def env(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("number", "code"),
-    [
-        # `test_a_terminated_export_says_so_and_leaves_no_file` sends SIGTERM
-        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
-        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
-        (signal.SIGINT, 130),
-    ],
+    ("number", "code"), [(signal.SIGHUP, 129), (signal.SIGINT, 130)]
 )
 def test_a_terminated_solve_cleans_up_and_prints_one_line(tmp_path, number, code):
     plugin = tmp_path / "hangs.py"

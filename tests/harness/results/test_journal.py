@@ -42,19 +42,6 @@ def test_a_line_is_on_the_disk_when_append_returns(tmp_path, monkeypatch):
             assert synced[-1] == file.read_bytes()
 
 
-@pytest.mark.parametrize("tail", ['{"schema": 1, "run', "\N{GREEK SMALL LETTER MU}"])
-def test_a_partial_last_line_is_not_read_and_cut_off_by_the_next_writer(tmp_path, tail):
-    with Journal(tmp_path, "here") as journal:
-        journal.append(record("a"))
-    file = tmp_path / "journal" / "here.jsonl"
-    file.write_bytes(file.read_bytes() + tail.encode()[:-1])
-
-    assert ids(tmp_path) == ["a"]
-    with Journal(tmp_path, "here") as journal:
-        journal.append(record("b"))
-    assert ids(tmp_path) == ["a", "b"]
-
-
 def test_a_journal_cut_at_any_byte_loses_only_the_line_that_was_cut(tmp_path):
     with Journal(tmp_path, "here") as journal:
         journal.append(record("a"))
@@ -75,17 +62,6 @@ def test_the_message_on_a_damaged_line_contains_the_remedy(tmp_path, bad):
     file.write_bytes(bad + b"\n")
 
     with pytest.raises(InputError, match=r"line 1: damaged .*; expected a JSON object"):
-        read_journal(tmp_path)
-
-
-@pytest.mark.parametrize("bad", ["nonsense", '{"schema": 99}', '{"schema": 1}', ""])
-def test_a_complete_invalid_line_is_named(tmp_path, bad):
-    with Journal(tmp_path, "here") as journal:
-        journal.append(record("a"))
-    file = tmp_path / "journal" / "here.jsonl"
-    file.write_text(file.read_text() + bad + "\n")
-
-    with pytest.raises(InputError, match=r"here\.jsonl, line 2: "):
         read_journal(tmp_path)
 
 

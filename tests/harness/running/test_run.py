@@ -2,13 +2,9 @@
 
 import errno
 import os
-import resource
 import shutil
-import signal
 import subprocess
 import sys
-from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +14,6 @@ from mortarbench.harness.errors import FaultError
 from mortarbench.harness.files.store import load_fields, load_solution
 from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import measurement as remote
-from mortarbench.harness.processes import supervisor
 from mortarbench.harness.registry import load_plugin, resolve
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
@@ -301,9 +296,7 @@ def test_an_interrupted_run_leaves_a_whole_journal_and_continues(measure, tmp_pa
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
-        pytest.param(
-            "build", "ZeroDivisionError: no stiffness", marks=pytest.mark.slow
-        ),
+        ("build", "ZeroDivisionError: no stiffness"),
         ("input", "tiny: fault=input is out of range"),
         ("memory", "it needs more memory than is available"),
         ("exit", "SystemExit: 3"),
@@ -392,12 +385,7 @@ def once_each(folder, count):
     return records
 
 
-@pytest.mark.parametrize(
-    "lost",
-    [
-        ".scratch", ".lock", pytest.param("vectors", marks=pytest.mark.slow),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("lost", [".scratch", ".lock", "vectors"])
 def test_files_deleted_during_a_run_lose_no_measurement(measure, tmp_path, lost):
     def delete():
         path = tmp_path / lost
@@ -461,31 +449,6 @@ def test_on_any_full_disk_a_run_ends_in_one_line_and_can_continue(
     assert writes > 6  # suite and environment need four writes
 
 
-@pytest.mark.parametrize("size", [600, 1500])
-def test_a_full_disk_in_the_case_worker_or_worker_yields_no_verdict(
-    measure, tmp_path, size
-):
-    """A file of a point is larger than 600 bytes, and a file of a case is larger than
-    1500 bytes.
-    """
-    whole = suite("honest", "prints")
-    if size == 600:
-        measure(suite("zero"))
-        shutil.rmtree(tmp_path / "journal")
-        shutil.rmtree(tmp_path / "vectors")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        with pytest.raises(InputError, match=r"File too large .* command continues"):
-            measure(whole)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert read_journal(tmp_path) == []
-
-    measure(whole)
-    assert {r.status for r in once_each(tmp_path, 2)} == {Verdict.VERIFIED}
-
-
 @pytest.fixture
 def faults(monkeypatch):
     """Cause a fault in measurements for which `prevented` returns True."""
@@ -503,25 +466,6 @@ def faults(monkeypatch):
     return faults
 
 
-def test_a_measurement_prevented_twice_is_retried_by_the_next_run(
-    measure, tmp_path, faults
-):
-    whole = suite("honest", "zero", repeats=2)
-    faults(lambda record: (record.solver, record.repeat) == ("zero", 0))
-    watched = measure(whole)
-
-    once_each(tmp_path, 3)
-    (fault,) = watched.faults
-    assert fault.startswith("zero on tiny/plain: ")
-    assert (len(watched.records), watched.skipped, watched.total) == (3, 1, 4)
-
-    faults(lambda record: False)
-    again = measure(whole)
-    assert again.faults == []
-    assert len(again.records) == 1
-    once_each(tmp_path, 4)
-
-
 def test_after_a_fault_a_sequence_is_repeated_from_its_first_step(
     measure, tmp_path, faults
 ):
@@ -532,35 +476,3 @@ def test_after_a_fault_a_sequence_is_repeated_from_its_first_step(
     assert tries == [0.5, 1.0, 0.5, 1.0, 1.5]
     assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
     assert (len(watched.records), watched.skipped) == (3, 0)
-
-
-def family(process):
-    """Yield a process and all of its descendants."""
-    yield process
-    for tasks in Path(f"/proc/{process}/task").glob("*/children"):
-        with suppress(OSError):
-            for child in tasks.read_text().split():
-                yield from family(int(child))
-
-
-@pytest.fixture
-def own_interpreters(monkeypatch):
-    """Start processes by commands, since forks have no own command in /proc."""
-    monkeypatch.setattr(supervisor, "subprocess", subprocess)
-
-
-def kill_worker(solver):
-    """Kill the worker of a solver, which has the solver's name as an argument."""
-    for process in list(family(os.getpid()))[1:]:
-        with suppress(OSError):
-            words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")
-            if solver.encode() in words:
-                os.kill(process, signal.SIGKILL)
-
-
-def test_a_worker_killed_between_two_steps_of_a_sequence_loses_no_step(
-    measure, tmp_path, own_interpreters
-):
-    measure(three_steps("chains"), after=1, act=lambda: kill_worker("chains"))
-
-    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
