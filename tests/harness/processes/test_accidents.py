@@ -226,17 +226,6 @@ def run_together(out, *solvers):
     return {s: [r for r in read_journal(out) if r.solver == s] for s in solvers}
 
 
-def check_neighbours(tmp_path, watched, careless):
-    got = run_together(tmp_path, "witness", *careless, "honest")
-
-    for neighbour in ("witness", "honest"):
-        found = [(r.status, r.message) for r in got[neighbour]]
-        assert found == [(Verdict.VERIFIED, "")] * 2
-    for solver in careless:
-        assert {r.status for r in got[solver]} == {OUTCOMES[solver][0]}
-    assert processes_of(watched) == []
-
-
 @pytest.mark.parametrize(
     "careless",
     [RUN_TOGETHER[:3], pytest.param(RUN_TOGETHER, marks=pytest.mark.slow)],
@@ -245,7 +234,14 @@ def check_neighbours(tmp_path, watched, careless):
 def test_measurements_beside_misbehaving_solvers_are_kept_and_undisturbed(
     tmp_path, watched, careless
 ):
-    check_neighbours(tmp_path, watched, careless)
+    got = run_together(tmp_path, "witness", *careless, "honest")
+
+    for neighbour in ("witness", "honest"):
+        found = [(r.status, r.message) for r in got[neighbour]]
+        assert found == [(Verdict.VERIFIED, "")] * 2
+    for solver in careless:
+        assert {r.status for r in got[solver]} == {OUTCOMES[solver][0]}
+    assert processes_of(watched) == []
 
 
 def test_sleeping_threads_may_stay_and_busy_threads_may_not(bench):

@@ -53,34 +53,13 @@ def test_cell_data_contain_the_body(grid):
     np.testing.assert_array_equal(grid.cell_data["body"][0], [0, 1])
 
 
-def test_cell_data_of_decomposed_bodies_contain_the_subdomain(grid, tmp_path):
-    assert set(grid.cell_data) == {"body"}
-    cells = np.array([[0, 1, 2, 3], [4, 5, 6, 6], [4, 6, 7, 7]])
-    torn = replace(
-        FIELDS, cells=cells, bodies=np.array([0, 1, 1]), subdomains=np.array([2, 0, 1])
+def test_a_family_states_the_subdomain_of_every_cell(tmp_path):
+    case = parse("beam-ring/Nr=4/Nh=3/steps=1/feti=3/dual", PROBLEMS).build(
+        reference_solution
     )
-    write_vtu(torn, tmp_path / "a.vtu")
-    found = meshio.read(tmp_path / "a.vtu")
-    by_kind = {b.type: i for i, b in enumerate(found.cells)}
-    of_cells = found.cell_data["subdomain"]
-    assert of_cells[by_kind["quad"]].tolist() == [2]
-    assert of_cells[by_kind["triangle"]].tolist() == [0, 1]
-
-
-@pytest.mark.parametrize(
-    ("name", "is_torn"),
-    [("beam-ring/Nr=4/Nh=3/steps=1/feti=3/dual", True),
-     ("beam-ring/Nr=4/Nh=3/steps=1/dual", False)],
-)  # fmt: skip
-def test_a_family_states_the_subdomain_of_every_cell(name, is_torn, tmp_path):
-    case = parse(name, PROBLEMS).build(reference_solution)
     answer = SOLVERS["smalbe"].prepare(case.qp, 1e-6)()
     fields = case.fields(answer)
     stored = load_fields(tmp_path, save(tmp_path, field_arrays(fields)))
-    if not is_torn:
-        assert fields.subdomains is None
-        assert stored.subdomains is None
-        return
     subdomains = case.quantities(answer)["subdomains"]
     assert np.unique(fields.subdomains).size == subdomains
     assert fields.subdomains.shape == (len(fields.cells),)
@@ -92,15 +71,17 @@ def test_a_family_states_the_subdomain_of_every_cell(name, is_torn, tmp_path):
 
 def test_triangles_are_triangles_with_their_bodies(tmp_path):
     cells = np.array([[0, 1, 2, 3], [4, 5, 6, 6], [4, 6, 7, 7]])
-    write_vtu(
-        replace(FIELDS, cells=cells, bodies=np.array([3, 4, 5])), tmp_path / "a.vtu"
+    torn = replace(
+        FIELDS, cells=cells, bodies=np.array([3, 4, 5]), subdomains=np.array([2, 0, 1])
     )
+    write_vtu(torn, tmp_path / "a.vtu")
     grid = meshio.read(tmp_path / "a.vtu")
 
     assert [block.type for block in grid.cells] == ["triangle", "quad"]
     np.testing.assert_array_equal(grid.cells[0].data, cells[1:, :3])
     np.testing.assert_array_equal(grid.cells[1].data, cells[:1])
     assert [body.tolist() for body in grid.cell_data["body"]] == [[4, 5], [3]]
+    assert [part.tolist() for part in grid.cell_data["subdomain"]] == [[0, 1], [2]]
 
 
 def test_contact_is_a_force_and_a_flag_without_gaps_elsewhere(grid):
@@ -192,19 +173,6 @@ def test_a_table_in_3d_has_areas_and_no_arc_length(tmp_path):
     assert table.friction.tolist() == ["open", "stick", "slip", ""]
 
 
-def test_a_node_of_two_contacts_has_the_larger_pressure_and_the_smaller_gap(tmp_path):
-    other = replace(
-        SIDE, name="b on c", pressure=np.array([0.0, 7.0, 0.0]),
-        gap=np.array([0.5, np.nan, np.nan]),
-    )  # fmt: skip
-    write_vtu(replace(FIELDS, contacts=(SIDE, other)), tmp_path / "a.vtu")
-    data = meshio.read(tmp_path / "a.vtu").point_data
-
-    assert data["pressure"].tolist() == [0, 0, 7.0, 6e5, 0, 0, 0, 0]
-    np.testing.assert_array_equal(data["gap"][[3, 2]], [-1e-18, 0.25])
-    assert np.isnan(data["gap"]).sum() == 6
-
-
 def test_grid_and_table_contain_shear_and_friction_states(tmp_path):
     rough = replace(
         SIDE, shear=np.array([1e5, -0.5, 0.0]),
@@ -273,13 +241,6 @@ def solve(tmp_path, capsys):
         return code, capsys.readouterr().err, path
 
     return solve
-
-
-def test_solve_writes_the_deformed_state(solve):
-    code, _, path = solve("beam-ring/Nr=1/Nh=1/steps=1/dual-bounds")
-
-    assert code == 0
-    assert "von_mises" in meshio.read(path).point_data
 
 
 def test_solve_refuses_unsupported_cases_and_formats(solve, manufactured, tmp_path):
@@ -353,3 +314,16 @@ def test_solids_are_written_by_cell_type_with_forces_in_newtons(tmp_path):
     assert along[["force_x_N", "force_y_N", "force_z_N"]].sum().tolist() == [0, 0, 8]
     assert along["area_m2"].sum() == 1
     assert along[["x_m", "y_m", "z_m"]].to_numpy().tolist() == corners[:4].tolist()
+
+
+def test_a_node_of_two_contacts_has_the_larger_pressure_and_the_smaller_gap(tmp_path):
+    other = replace(
+        SIDE, name="b on c", pressure=np.array([0.0, 7.0, 0.0]),
+        gap=np.array([0.5, np.nan, np.nan]),
+    )  # fmt: skip
+    write_vtu(replace(FIELDS, contacts=(SIDE, other)), tmp_path / "a.vtu")
+    data = meshio.read(tmp_path / "a.vtu").point_data
+
+    assert data["pressure"].tolist() == [0, 0, 7.0, 6e5, 0, 0, 0, 0]
+    np.testing.assert_array_equal(data["gap"][[3, 2]], [-1e-18, 0.25])
+    assert np.isnan(data["gap"]).sum() == 6
