@@ -1,8 +1,5 @@
 """QPs from arrays: accepted input, and error messages."""
 
-import doctest
-from importlib import import_module
-
 import cvxpy
 import numpy as np
 import pytest
@@ -160,21 +157,3 @@ def test_a_semidefinite_matrix_is_convex_up_to_rounding():
 
     assert QP.from_arrays(B @ B.T, np.zeros(40)).q.size == 40
     assert QP.from_arrays(eye_array(600) * 0, np.zeros(600)).q.size == 600
-
-
-@pytest.mark.parametrize(
-    "module",
-    [
-        "digest", "errors", "files.qpfile", "mechanics", "names", "operators",
-        "plugin", "qp", "record", "registry", "sets.box", "solution", "verify.kkt",
-    ],
-)  # fmt: skip
-def test_the_examples_of_docstrings_print_the_output_shown(module):
-    result = doctest.testmod(
-        import_module(f"mortarbench.harness.{module}"),
-        globs={"__name__": "builtins"},  # as in a session, not in the module
-        optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE,
-    )
-
-    assert result.attempted > 0
-    assert result.failed == 0

@@ -1,13 +1,22 @@
 """Examples in the docstrings of exported functions print the output that is shown."""
 
 import doctest
+from importlib import import_module
 
 import pytest
 
 import mortarbench as mb
 from mortarbench.listing import problems, solvers
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support import ROOT
 
+#: modules of the packages that `mortarbench` imports, with examples
+MODULES = [
+    str(path.relative_to(ROOT)).removesuffix(".py").replace("/", ".")
+    for package in ("harness", "problems", "solvers")
+    for path in sorted((ROOT / package).rglob("*.py"))
+    if ">>> " in path.read_text("utf-8")
+]
 EXAMPLES = {
     "mortarbench": mb,
     "plot": mb.Answer.plot,
@@ -44,3 +53,13 @@ def test_the_examples_of_a_docstring_are_true(name, tmp_path, monkeypatch, capsy
 
     assert result.attempted > 1
     assert result.failed == 0, capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_the_examples_of_a_module_are_true(name):
+    result = doctest.testmod(
+        import_module(f"mortarbench.{name}"),
+        globs={"__name__": "builtins"},  # as in a session, not in the module
+        optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE,
+    )
+    assert result.failed == 0

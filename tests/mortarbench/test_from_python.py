@@ -17,7 +17,6 @@ from tests.support.active_row import QP, ActiveRow, Hangs
 pytestmark = pytest.mark.together
 
 SMALL = "beam-ring/Nr=4/Nh=3/steps=1/dual"
-FURTHER = ("dual-bounds", "primal")  #: forms
 
 
 def test_a_qp_is_solved_like_a_case():
@@ -136,11 +135,8 @@ print(*(result.grade for result in found.results.values()))
 """
 
 
-@pytest.mark.parametrize("threads", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, threads):
-    """The class is also copied if the script, like a notebook, has several threads and
-    must not fork.
-    """
+def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path):
+    """The script, like a notebook, has several threads and must not fork."""
     (tmp_path / "beside.py").write_text(
         "HALF = 0.5\ndef solve(d, q):\n    return -q / d\n"
     )
@@ -148,7 +144,7 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
         "import threading, time\n"
         "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
     )
-    (tmp_path / "script.py").write_text(start * threads + SCRIPT)
+    (tmp_path / "script.py").write_text(start + SCRIPT)
     done = subprocess.run(
         [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True,
         check=False,
@@ -157,37 +153,6 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
     assert done.stdout.splitlines() == ["verified [1.0, 0.5] Exact", "decline"], (
         done.stderr
     )
-
-
-@pytest.mark.slow
-def test_modules_of_a_script_do_not_hide_installed_modules_in_workers(tmp_path):
-    """A worker imports a module of the script, but not `solvers.py` and `msgspec.py`
-    from the same folder, which raise an error.
-    """
-    for name in ("solvers", "msgspec"):
-        (tmp_path / f"{name}.py").write_text("raise ImportError('not for workers')\n")
-    (tmp_path / "helper.py").write_text(
-        "import mortarbench as mb, numpy as np\n"
-        "class Zero:\n"
-        "    def declines(self, qp): return None\n"
-        "    def prepare(self, qp, tol):\n"
-        "        z = np.zeros\n"
-        "        return lambda: mb.Solution(status=mb.Status.SOLVED, x=z(qp.q.size), "
-        "y=z(0), z=z(0), z_box=z(qp.q.size))\n"
-    )
-    program = (
-        "import sys; here = sys.path.pop(0)\n"
-        "import mortarbench as mb\n"
-        f"sys.path.append({str(tmp_path)!r})\n"
-        "from helper import Zero\n"
-        "print(mb.solve(mb.QP.from_arrays([[1.0]], [0.0]), Zero()).verdict)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
-
-    assert done.stdout == "verified\n", done.stderr
 
 
 class _Uncopied(ActiveRow):
@@ -248,14 +213,11 @@ def test_wrong_multipliers_are_refuted_at_the_right_point():
     assert mb.verify(QP, [0.5, 0.5], z=[0.0]).residuals.dual > 0.1
 
 
-@pytest.mark.parametrize(
-    "form", ["dual", *(pytest.param(f, marks=pytest.mark.slow) for f in FURTHER)]
-)
-def test_verify_agrees_with_solve(form):
+def test_verify_agrees_with_solve():
     """`verify` is called with the point alone and with the multipliers of
     the solver.
     """
-    case = mb.build(f"beam-ring/Nr=4/Nh=3/steps=1/{form}")
+    case = mb.build(SMALL)
     answer = mb.solve(case, "clarabel")
     s = answer.solution
     given = mb.verify(case, s.x, s.y, s.z, s.z_box)
@@ -354,14 +316,6 @@ def test_an_unknown_figure_is_refused_with_the_available_ones(results, tmp_path)
         results.plot("acuracy")
     with pytest.raises(mb.InputError, match=r"unknown format '\.txt'"):
         results.plot("accuracy", tmp_path / "a.txt")
-
-
-def test_a_measurement_is_replayed(results):
-    found = mb.replay(results.folder, results.df.run_id[0])
-
-    assert found.reproduced
-    assert found.same_qp
-    assert repr(found).endswith("Reproduced: the same verdict.")
 
 
 def test_the_name_of_a_function_is_not_taken_by_a_module():

@@ -1,6 +1,5 @@
 """Manufactured QPs: planted solutions and verdicts."""
 
-import doctest
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import Box, Cones, Discs, needs_matrices
-from mortarbench.harness.conformance import manufactured
 from mortarbench.harness.conformance.conformance import CHECKS, Grade, run_check
 from mortarbench.harness.conformance.manufactured import (
     SET_SHAPES,
@@ -18,10 +16,6 @@ from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
-
-
-def test_the_example_of_the_documentation_holds():
-    assert doctest.testmod(manufactured).failed == 0
 
 
 @pytest.mark.parametrize("shape", SET_SHAPES)

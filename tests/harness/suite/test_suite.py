@@ -211,19 +211,6 @@ def test_mistakes_in_solvers_are_reported_with_their_place(load, entry, message)
     assert f"demo.toml: {message}" in str(e.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("name = \n", "line 1, column 8: Invalid value"),
-        ("name = 'a'\nname = 'b'\n", "line 2, column 11: Cannot overwrite a value"),
-        ("name = [", "end of document: Invalid value"),
-    ],
-)
-def test_malformed_toml_is_named_by_line(load, text, message):
-    with pytest.raises(InputError, match=rf"demo\.toml: {message}"):
-        load(text)
-
-
 @pytest.fixture
 def demo(load):
     return load(
