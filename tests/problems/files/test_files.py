@@ -258,18 +258,11 @@ def test_a_compressed_file_is_the_file(written, tmp_path, name):
         ("a.qps", "a.qps: not UTF-8"),
     ],
 )
-<<<<<<< HEAD
-def test_unknown_formats_are_refused_compressed_or_not(written, name, message):
-    with refused(message):
-        built(written("", name))
-=======
 def test_files_of_other_formats_are_refused(tmp_path, written, name, message):
     text = written("", name)
     (tmp_path / name).write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError) as e:
-        build(text)
-    assert message in str(e.value)
->>>>>>> 99bfdc67 (Drop tests of files that other tests hold)
+    with refused(message):
+        built(text)
 
 
 def test_the_name_of_a_set_may_be_left_out():
@@ -379,26 +372,9 @@ def test_names_with_spaces_need_fixed_columns(written):
 
 
 @pytest.mark.parametrize("line", ["OBJSENSE MAX", "OBJSENSE\n    maximize"])
-<<<<<<< HEAD
-def test_a_maximised_linear_objective(written, line):
-    """The maximum of x₁ + 2x₂ for 0 ≤ x and x₁ + x₂ ≤ 2 is 4, at (0, 2)."""
-    text = (
-        f"NAME\n{line}\nROWS\n N obj\n L sum\nCOLUMNS\n x1 obj 1 sum 1\n"
-        " x2 obj 2 sum 1\nRHS\n rhs sum 2 obj -1\nENDATA\n"
-    )
-    case = built(written(text, "a.mps"))
-
-    assert value_of(case) == pytest.approx(5.0)  # with the constant 1
-
-
-def test_a_maximised_objective_is_minus_a_minimised_one(written):
-    concave = QPS.replace("8.0", "-8.0").replace("10.0", "-10.0")
-    case = built(written(concave.replace("ROWS", "OBJSENSE\n    MAX\nROWS"), "a.QPS"))
-=======
 def test_a_maximised_objective_is_minus_a_minimised_one(written, line):
     concave = QPS.replace("8.0", "-8.0").replace("10.0", "-10.0")
-    case = build(written(concave.replace("ROWS", f"{line}\nROWS"), "a.QPS"))
->>>>>>> 99bfdc67 (Drop tests of files that other tests hold)
+    case = built(written(concave.replace("ROWS", f"{line}\nROWS"), "a.QPS"))
     s = solved(case.qp)
 
     # maximum of −4c₁² + 2c₁c₂ − 5c₂² + 1.5c₁ − 2c₂ + 4 with r1 and r2 at their lower
@@ -582,20 +558,6 @@ def test_rounding_does_not_make_a_semidefinite_p_non_convex(written, P):
     assert built(written({"P": csc_matrix(np.array(P)), **free}, "a.mat")).qp.q.size
 
 
-<<<<<<< HEAD
-def test_other_files_are_refused(written, tmp_path):
-    name = written("no mat file", "a.mat")
-    with pytest.raises(InputError, match=r"a\.mat: not a \.mat file"):
-        built(name)
-    with pytest.raises(InputError, match=r"b\.mat: No such file"):
-        built("file:b.mat")
-    (tmp_path / "a.qps").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match=r"a\.qps: not UTF-8"):
-        built("file:a.qps")
-
-
-=======
->>>>>>> 99bfdc67 (Drop tests of files that other tests hold)
 # names
 
 
@@ -704,31 +666,6 @@ def test_the_dual_s_matrices_satisfy_the_formulas_of_the_paper(written, command,
         assert R.shape == (f.size, 0)
 
 
-<<<<<<< HEAD
-=======
-def test_unknown_export_formats_are_refused_with_the_available_ones(written, command):
-    code, _, err = command("export", f"{SMALL}/primal", "a.csv")
-
-    assert code == 2
-    assert err == (
-        "mortarbench: a.csv: unknown format '.csv'; expected .npz or .mat or .parquet "
-        "or .qps or .json or .bin or .cbf\n"
-    )
-
-
-def test_a_file_can_be_solved_by_name(written, command):
-    code, out, _ = command(
-        "solve", written(QPS, "a.qps"), "--solver", "clarabel", "--json"
-    )
-    record = json.loads(out)
-
-    assert code == 0
-    assert record["case"] == "file:a.qps"
-    assert len(record["params"]["sha256"]) == 12
-    assert record["quantities"]["value"] == pytest.approx(record["objective"] + 4)
-
-
->>>>>>> 99bfdc67 (Drop tests of files that other tests hold)
 @pytest.fixture
 def two_rows(tmp_path, monkeypatch):
     """A Parquet file in the working directory with the minima of ½x² − x and ½x² − 2x,
