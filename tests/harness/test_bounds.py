@@ -5,7 +5,6 @@ import os
 
 import pytest
 
-from mortarbench.cli.main import main
 from mortarbench.harness import InputError
 from mortarbench.harness.errors import one_line, shown
 from mortarbench.harness.files.reading import read_json, read_toml, toml
@@ -14,8 +13,8 @@ from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.suite import load_suite
 from mortarbench.problems import PROBLEMS
-from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
+from tests.support.refusals import refused
 
 SUITE = 'name = "s"\nsolvers = ["osqp"]\n[[problems]]\nfamily = "beam-ring"\n'
 
@@ -47,23 +46,6 @@ def journal(tmp_path):
         return tmp_path
 
     return journal
-
-
-@pytest.fixture
-def refused(capsys, monkeypatch, tmp_path):
-    """Return a function that runs a command, asserts exit code 2 and one line of error
-    output, and returns this line.
-    """
-    monkeypatch.chdir(tmp_path)
-    registries = Registries()
-
-    def refused(*argv):
-        assert main(registries, [str(word) for word in argv]) == 2
-        message = capsys.readouterr().err
-        assert message.count("\n") == 1
-        return message
-
-    return refused
 
 
 @pytest.mark.parametrize(
@@ -137,11 +119,8 @@ def test_a_repeated_line_counts_once_and_is_reported(journal):
 def test_two_contradictory_lines_on_one_measurement_are_refused(journal):
     folder = journal(record("b"), record("a"), record("a", status=Verdict.WRONG))
 
-    with pytest.raises(InputError) as e:
+    with refused("here.jsonl, line 3: differs from an earlier record of run_id 'a'; "):
         read_journal(folder)
-    assert "here.jsonl, line 3: differs from an earlier record of run_id 'a'; " in str(
-        e.value
-    )
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from mortarbench.harness import DERIVED, Family, InputError, Range
 from mortarbench.harness.names import CaseId, assemble, match, parse
+from tests.support.refusals import refused
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,11 +130,8 @@ def test_a_canonical_name_parses_to_the_case_that_it_names(form, **params):
     ],
 )
 def test_an_invalid_name_is_reported_in_one_line(text, message):
-    with pytest.raises(InputError) as e:
+    with refused(start=message):
         parse(text, FAMILIES)
-
-    assert str(e.value).startswith(message)
-    assert "\n" not in str(e.value)
 
 
 def test_patterns_are_shell_globs_over_the_whole_name_with_case():

@@ -19,6 +19,7 @@ from mortarbench.harness.registry import (
     resolve,
 )
 from mortarbench.registries import Registries
+from tests.support.refusals import refused
 
 
 @dataclass(frozen=True)
@@ -100,11 +101,8 @@ def test_a_wildcard_entry_takes_the_text_after_the_colon_as_backend():
     ],
 )
 def test_an_invalid_solver_is_reported_in_one_line(asked, message):
-    with pytest.raises(InputError) as e:
+    with refused(start=message):
         resolve(asked, SOLVERS)
-
-    assert str(e.value).startswith(message)
-    assert "\n" not in str(e.value)
 
 
 PLUGIN = """
@@ -185,11 +183,8 @@ def test_an_invalid_plugin_is_reported_in_one_line(tmp_path, text, message):
     file = tmp_path / "plug.py"
     file.write_text(text)
 
-    with pytest.raises(InputError) as e:
+    with refused(start=f"{file}: {message}"):
         load_plugin(file)
-
-    assert str(e.value).startswith(f"{file}: {message}")
-    assert "\n" not in str(e.value)
 
 
 def test_a_plugin_that_is_missing_or_not_a_python_file_is_refused(tmp_path):

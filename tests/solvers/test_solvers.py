@@ -52,7 +52,6 @@ LIBRARIES = {name: _module(name) for name in NATIVE} | {
     "cvxpy:OSQP": "cvxpy",
 }
 
-every_solver = pytest.mark.parametrize("name", CONCRETE)
 every_native_solver = pytest.mark.parametrize("name", NATIVE)
 
 

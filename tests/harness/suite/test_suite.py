@@ -14,6 +14,7 @@ from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.suite.solver_options import selected
 from mortarbench.harness.suite.suite import load_suite
 from tests.support import ROOT
+from tests.support.refusals import refused
 
 
 @dataclass(frozen=True)
@@ -182,11 +183,8 @@ def test_a_case_of_two_blocks_is_measured_once(load):
 def test_mistakes_are_reported_with_file_place_and_remedy(
     load, tmp_path, text, message
 ):
-    with pytest.raises(InputError) as e:
+    with refused(start=f"{tmp_path / 'demo.toml'}: {message}"):
         load(text)
-
-    assert str(e.value).startswith(f"{tmp_path / 'demo.toml'}: {message}")
-    assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize(
@@ -205,10 +203,8 @@ def test_mistakes_are_reported_with_file_place_and_remedy(
     ],
 )
 def test_mistakes_in_solvers_are_reported_with_their_place(load, entry, message):
-    with pytest.raises(InputError) as e:
+    with refused(f"demo.toml: {message}"):
         load(f"name = 'a'\nsolvers = ['osqp', {entry}]\n{BLOCK}")
-
-    assert f"demo.toml: {message}" in str(e.value)
 
 
 @pytest.fixture
