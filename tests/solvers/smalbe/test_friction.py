@@ -38,9 +38,7 @@ def products(solutions):
     return sum(s.counts["P_products"] for s in solutions)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(CASES[0], marks=pytest.mark.slow), *CASES[1:]]
-)
+@pytest.mark.parametrize("name", CASES)
 def test_friction_takes_fewer_products_than_published_rules(name):
     qp, exact = emitted(name), reference_solution(emitted(name))
     found = {s: SOLVERS[s].prepare(qp, TOL)() for s in ("smalbe", *PRESETS)}

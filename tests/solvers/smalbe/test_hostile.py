@@ -68,21 +68,15 @@ def ends(name, seeds):
     return given_up, runs, wrong
 
 
-@pytest.mark.parametrize(
-    "seeds",
-    [range(1000, 1015), pytest.param(range(1000, 1060), marks=pytest.mark.slow)],
-)
 @pytest.mark.parametrize("name", ["smalbe", "smalbe-direct"])
-def test_no_claim_is_wrong(name, seeds):
-    given_up, runs, wrong = ends(name, seeds)
+def test_no_claim_is_wrong(name):
+    given_up, runs, wrong = ends(name, range(1000, 1015))
 
     assert wrong == []
     assert given_up <= 0.02 * runs
 
 
-@pytest.mark.parametrize(
-    "seed", [343, 0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 8))]
-)
+@pytest.mark.parametrize("seed", [343, 0, 1])
 @pytest.mark.parametrize("name", ["smalbe", "smalbe-direct"])
 def test_without_a_cost_any_feasible_point_is_found_optimal(name, seed):
     """The multipliers are then zero, and 1 is the scale of their errors."""

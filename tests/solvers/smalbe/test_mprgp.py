@@ -226,17 +226,10 @@ def test_an_unbounded_cost_is_not_called_a_minimum(minimise):
 
 
 @pytest.mark.parametrize("rules", [Rules(), PROJECTED], ids=["model", "projected cg"])
-@pytest.mark.parametrize(
-    "seed",
-    [
-        271828,
-        *(pytest.param(seed, marks=pytest.mark.slow) for seed in (314159, 161803)),
-    ],
-)
 def test_every_iterate_is_feasible_and_the_cost_never_rises(
-    minimise, manufactured, seed, rules
+    minimise, manufactured, rules
 ):
-    qp, _ = manufactured("box", seed=seed, dense=True, n=24)
+    qp, _ = manufactured("box", seed=271828, dense=True, n=24)
     costs = []
     for steps in range(30):
         run, _ = minimise(

@@ -246,22 +246,6 @@ def test_options_that_cannot_work_are_refused(wrong):
         SMALBE(**wrong)
 
 
-def test_every_product_with_F_is_counted(dual):
-    qp = dual(271828)
-    products = []
-
-    class Counting:
-        shape, dtype = qp.P.shape, qp.P.dtype
-
-        def __matmul__(self, v):
-            products.append(v)
-            return qp.P @ v
-
-    s = SMALBE().prepare(replace(qp, P=Counting()), 1e-8)()
-
-    assert s.counts["P_products"] == len(products)
-
-
 def test_products_are_explained_by_the_steps(dual):
     """The total is 5 for Lanczos (n = 30), one for homogenisation, none for the start
     at 0, 1 for each c, b or p, 2 for each e, 3 for each f, and one for the residual of
@@ -273,19 +257,6 @@ def test_products_are_explained_by_the_steps(dual):
     steps = c.get("cg", 0) + c.get("beyond", 0) + c.get("proportioning", 0)
     steps += 2 * c.get("expansion", 0) + 3 * c.get("fallback", 0)
     assert c["P_products"] == 5 + 1 + steps + 1
-
-
-def test_with_equalities_only_it_agrees_with_the_saddle_point_system():
-    rng = np.random.default_rng(271828)
-    W, A, b = rng.standard_normal((12, 12)), rng.standard_normal((3, 12)), rng.random(3)
-    qp = bounded(W @ W.T, rng.standard_normal(12), A, b)
-    K = np.block([[qp.P, A.T], [A, np.zeros((3, 3))]])
-    exact = np.linalg.solve(K, np.concatenate([-qp.q, b]))
-
-    s = SMALBE().prepare(qp, 1e-11)()
-
-    assert s.x == pytest.approx(exact[:12], abs=1e-8)
-    assert s.y == pytest.approx(exact[12:], abs=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -310,16 +281,6 @@ def test_degenerate_problems_have_their_solutions(qp, x):
     assert s.status is Status.SOLVED
     assert s.x == pytest.approx(x, abs=1e-8)
     assert kkt_residuals(qp, s).worst <= 1e-9
-
-
-def test_too_few_steps_are_not_called_solved(dual):
-    qp = dual(271828)
-    needed = SMALBE().prepare(qp, 1e-8)().iterations
-    s = SMALBE(max_steps=needed // 2).prepare(qp, 1e-8)()
-
-    assert s.status is Status.ITERATION_LIMIT
-    assert 0 < s.iterations <= needed // 2
-    assert "step limit" in s.message
 
 
 @pytest.mark.parametrize("orders", [6, 9])
@@ -378,19 +339,6 @@ def test_the_carried_gradient_is_the_gradient(outer_loop, dual, rho, rounding):
     assert end.g == pytest.approx(fresh, abs=rounding)
 
 
-def test_the_projected_problem_is_normalised_and_projected(dual):
-    qp = dual(271828)
-    problem = projected(qp, 30)
-    C = problem.rows.C
-    H = hessian(problem, 0.0)
-
-    assert C @ C.T == pytest.approx(np.eye(3), abs=1e-14)
-    assert np.linalg.norm(H, 2) == pytest.approx(1, rel=1e-6)
-    assert abs(H @ C.T).max() < 1e-14
-    assert abs(C @ problem.b).max() < 1e-14
-    assert qp.A @ problem.rows.x_tilde == pytest.approx(qp.b)
-
-
 def test_rank_is_found_among_badly_scaled_rows():
     G = np.array([[1e8, 0, 0, 0], [1e-8, 1e-8, 0, 0], [1, 1, 0, 0]])
     rows = orthonormal_rows(G, G @ np.array([1.0, 2.0, 3.0, 4.0]))
@@ -439,14 +387,9 @@ def test_scaling_the_rows_changes_no_step(dual, exponent):
 
 
 @pytest.mark.parametrize("shape", ["bounds", "box", "equalities", "some bounds"])
-@pytest.mark.parametrize(
-    "seeds",
-    [range(1000, 1040), pytest.param(range(1040, 1125), marks=pytest.mark.slow)],
-    ids=["40", "85 more"],
-)
-def test_random_planted_problems_are_solved_and_certified(manufactured, shape, seeds):
+def test_random_planted_problems_are_solved_and_certified(manufactured, shape):
     """Every answer has small residuals and equals the planted solution."""
-    for seed in seeds:
+    for seed in range(1000, 1040):
         qp, planted_point = manufactured(shape, seed=seed, dense=seed % 2 == 0)
         s = SMALBE().prepare(qp, 1e-9)()
 
@@ -473,10 +416,6 @@ def test_every_combination_of_rules_solves(
     [
         (4, 3, 1, (46, 56)), (4, 3, 10, (54, 73)),
         (12, 6, 5, (59, 84)), (12, 6, 10, (72, 103)), (12, 7, 10, (58, 87)),
-        pytest.param(30, 15, 1, (57, 90), marks=pytest.mark.slow),
-        pytest.param(30, 15, 5, (58, 91), marks=pytest.mark.slow),
-        pytest.param(30, 15, 10, (67, 107), marks=pytest.mark.slow),
-        pytest.param(60, 30, 5, (64, 105), marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
@@ -499,44 +438,16 @@ def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
         assert s.counts["P_products"] <= most
 
 
-@pytest.mark.slow
-def test_few_products_suffice_with_bounds_only():
-    family = PROBLEMS["beam-ring"]
-    configured = family.with_keys(Nr=30, Nh=15, step=5)
-    qp = configured.build("dual-bounds", reference_solution).qp
-    s = SMALBE().prepare(qp, 1e-8)()
-
-    assert kkt_residuals(qp, s).worst <= 1e-7
-    assert s.counts["P_products"] <= 50
-
-
 @pytest.mark.parametrize("tol", [1e-2, 1e-4, 1e-6])
-@pytest.mark.parametrize(
-    "seeds",
-    [range(2000, 2020), pytest.param(range(2020, 2060), marks=pytest.mark.slow)],
-    ids=["20", "40 more"],
-)
-def test_the_residual_of_the_original_problem_decides(dual, tol, seeds):
+def test_the_residual_of_the_original_problem_decides(dual, tol):
     """The residual of the projected problem may be smaller."""
-    for seed in seeds:
+    for seed in range(2000, 2020):
         qp = dual(seed)
         for name in ("smalbe", "smalbe-permon"):
             s = SOLVERS[name].prepare(qp, tol)()
 
             assert s.status is Status.SOLVED
             assert relative_residual(qp, s, tol) <= tol * (1 + 1e-9)
-
-
-def test_multipliers_leave_no_gradient_that_rows_could_take(dual):
-    """On free components, Fx − d + Gᵀy is orthogonal to the rows."""
-    qp = dual(271828)
-    s = SMALBE().prepare(qp, 1e-3)()
-    free = s.x > qp.lb
-    left = (qp.P @ s.x + qp.q + qp.A.T @ s.y)[free]
-    size = np.linalg.norm(left)
-
-    assert size > 1e-8
-    assert np.linalg.norm(qp.A[:, free] @ left) <= 1e-9 * size
 
 
 def test_an_inner_run_ends_at_eta_at_the_latest(outer_loop, dual):
@@ -553,6 +464,7 @@ def test_steps_and_outer_iterations_together_count_for_the_limit(dual):
     s = SMALBE(max_steps=30, rho=1e-3).prepare(dual(271828), 1e-10)()
 
     assert s.status is Status.ITERATION_LIMIT
+    assert s.iterations > 0
     assert s.iterations + s.counts["outer"] <= 31
     assert s.message == "step limit"
 

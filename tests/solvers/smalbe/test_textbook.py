@@ -331,19 +331,6 @@ def agreeing_answers(qp, tol=1e-8):
     return fast, slow
 
 
-@pytest.mark.parametrize("shape", ["bounds", "box", "some bounds", "equalities"])
-@pytest.mark.parametrize("seed", range(5))
-def test_the_compiled_solver_has_the_answers_of_the_textbook(manufactured, shape, seed):
-    """The minimiser and the multipliers are unique."""
-    qp, _ = manufactured(shape, seed=seed)
-    fast, slow = agreeing_answers(qp)
-
-    for name in ("x", "y", "z_box"):
-        expected = getattr(fast, name)
-        size = np.abs(expected).max(initial=1e-9)
-        assert getattr(slow, name) == pytest.approx(expected, abs=1e-6 * size)
-
-
 @pytest.mark.parametrize("rows", [0, 2])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_compiled_solver_has_the_answers_of_the_textbook_on_discs(seed, rows):
@@ -358,11 +345,8 @@ def test_the_compiled_solver_has_the_answers_of_the_textbook_on_discs(seed, rows
         "beam-ring/Nr=4/Nh=3/step=10/dual",
         "membranes/S=2/n=4/dual",  # P is an operator, and rows are those of subdomains
         "greco/n=16/dual",
-        pytest.param("hertz-plane/n=4/feti=16/dual", marks=pytest.mark.slow),
-        pytest.param("contact-patch/dim=3/friction=coulomb/mu=0.2/dual",
-                     marks=pytest.mark.slow),
     ],
-)  # fmt: skip
+)
 def test_contact_forces_agree_with_those_of_the_textbook(case):
     qp = parse(case, PROBLEMS).build(reference_solution).qp
     fast, slow = agreeing_answers(qp)
@@ -373,10 +357,9 @@ def test_contact_forces_agree_with_those_of_the_textbook(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1000, 1015))
-def test_no_claim_about_a_hostile_qp_is_wrong(seed):
+def test_no_claim_about_a_hostile_qp_is_wrong():
     """The QPs have solutions; see `tests.solvers.smalbe.test_hostile`."""
-    _, runs, wrong = ends("smalbe-textbook", [seed])
+    _, runs, wrong = ends("smalbe-textbook", range(1000, 1015))
 
-    assert runs == 3
+    assert runs == 45
     assert wrong == []

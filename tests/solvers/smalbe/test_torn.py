@@ -152,19 +152,6 @@ def test_a_preconditioner_is_built_once():
     assert F.preconditioner_parts("lumped", "stiffness") is not built
 
 
-def test_a_sequence_is_warm():
-    qps = [case(Nr=8, Nh=4, steps=3, step=k, feti=8).qp for k in (1, 2, 3)]
-    prepare = SMALBE().chain(1e-6)
-    warm = [prepare(qp)() for qp in qps]
-    cold = [SMALBE().prepare(qp, 1e-6)() for qp in qps]
-
-    for qp, s in zip(qps, warm, strict=True):
-        assert kkt_residuals(qp, s).worst <= 1e-5
-    assert sum(s.counts["P_products"] for s in warm) < sum(
-        s.counts["P_products"] for s in cold
-    )
-
-
 @pytest.mark.parametrize("basis", ["standard", "dual"])
 @pytest.mark.parametrize("parts", [4, 20])
 def test_a_disc_whose_rotation_only_fixed_rows_prevent_is_solved(
