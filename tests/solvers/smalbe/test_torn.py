@@ -144,14 +144,6 @@ class InPython:
         return lambda x: M(x)
 
 
-def test_a_preconditioner_is_built_once():
-    F = build("membranes/S=2/n=4/dual").qp.P.build()
-
-    built = F.preconditioner_parts("dirichlet", "stiffness")
-    assert F.preconditioner_parts("dirichlet", "stiffness") is built
-    assert F.preconditioner_parts("lumped", "stiffness") is not built
-
-
 @pytest.mark.parametrize("basis", ["standard", "dual"])
 @pytest.mark.parametrize("parts", [4, 20])
 def test_a_disc_whose_rotation_only_fixed_rows_prevent_is_solved(
