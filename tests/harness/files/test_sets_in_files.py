@@ -111,7 +111,7 @@ def test_mat_and_parquet_with_broken_sets_are_refused(tmp_path):
     arrays = {k: v for k, v in loadmat(path).items() if k[0] != "_"}
     savemat(path, arrays | {"disc_index": "text"})
     with pytest.raises(
-        mb.InputError, match="qp.mat: Discs: index is of type <U4; expected an"
+        mb.InputError, match=r"qp\.mat: Discs: index is of type <U4; expected an"
     ):
         mb.build(f"file:{path}")
     path = mb.export(qp, tmp_path / "qp.parquet")
