@@ -26,16 +26,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, issparse
+from scipy.sparse import issparse
 
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.datafile import json_object
 from mortarbench.harness.files.durable import writing
 from mortarbench.harness.files.isolated import read_isolated
 from mortarbench.harness.files.qpfile import (
-    csc_parts,
     explicit_matrices,
-    listed_dense,
     malformed,
     qp_of,
 )
@@ -120,11 +117,8 @@ def load_parquet(path: Path, row: int | None = None) -> tuple[QP, dict[str, Any]
             raise ValueError(f"{odd[0]} is not a list of numbers")
         if not {"P", "q"} <= arrays.keys():
             raise ValueError("P or q is null; expected lists of numbers")
-        meta = json_object(head["meta"])
-        dense = listed_dense(meta) if "dense" in meta else _MATRICES
         for name in arrays.keys() & _MATRICES:
-            M = _matrix(name, arrays.pop(name), arrays["q"].size)
-            arrays |= {name: M} if name in dense else csc_parts(name, csc_array(M))
+            arrays[name] = _matrix(name, arrays[name], arrays["q"].size)
         return qp_of({**arrays, "meta": np.array(head["meta"])})
 
 

@@ -160,14 +160,10 @@ def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[s
         matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
         arrays["fixed"] = qp.structure.fixed
     for name, M in matrices.items():
-        arrays |= csc_parts(name, csc_array(M))
+        M = csc_array(M)
+        parts = (M.data, M.indices, M.indptr, np.array(M.shape))
+        arrays |= {f"{name}_{k}": a for k, a in zip(_PARTS, parts, strict=True)}
     return arrays, dense
-
-
-def csc_parts(name: str, M: csc_array) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a matrix by their names in files."""
-    parts = (M.data, M.indices, M.indptr, np.array(M.shape))
-    return {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
 
 
 def load_qp(
@@ -258,10 +254,13 @@ def qp_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[QP, dict[str, Any]]:
             raise unknown("array", name, (*VECTORS, *_MATRICES))
     parts: dict[str, Any] = {name: stored_matrix(arrays, name) for name in _MATRICES}
     parts |= {name: _vector(arrays, name) for name in VECTORS if name in arrays}
-    for name in listed_dense(meta):
-        if issparse(parts[name]):
-            check_dense(name, parts[name])
-            parts[name] = parts[name].toarray()
+    for name in _MATRICES if "dense" in meta else ():
+        M = parts[name]
+        if issparse(M) and name in listed_dense(meta):
+            check_dense(name, M)
+            parts[name] = M.toarray()
+        elif isinstance(M, np.ndarray) and name not in listed_dense(meta):
+            parts[name] = csc_array(M)
     qp = QP.from_arrays(**{"q": None, **parts}, sets=further_sets(arrays))
     return qp, meta
 
