@@ -26,6 +26,7 @@ from typing import Any, BinaryIO
 
 import msgspec
 
+from mortarbench.harness.checked import located
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import FULL
 from mortarbench.harness.limits import limit_of
@@ -136,13 +137,11 @@ def read_text(
         raise InputError(f"{path}: not UTF-8; expected {expected}") from None
 
 
-def read_toml(path: Path, expected: str = "a TOML file") -> dict[str, Any]:
-    """Read and parse a TOML file; `expected` describes it in messages."""
-    text = read_text(path, expected, MAX_TOML_MIB)
-    try:
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read and parse a TOML file."""
+    text = read_text(path, "a TOML file", MAX_TOML_MIB)
+    with located(f"{path}"):
         return toml(text)
-    except InputError as e:
-        raise InputError(f"{path}: {e}") from None
 
 
 def toml(text: str) -> dict[str, Any]:
