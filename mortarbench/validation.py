@@ -99,14 +99,13 @@ def validate(
     if not checked.is_number(budget) or not budget >= 0:  # `not ≥` also rejects NaN
         raise InputError(f"budget = {shown(budget)}; expected a number of seconds ≥ 0")
     registries = load_registries(plugins, registries)
-    from mortarbench.harness.crossval.summary import as_data
     from mortarbench.harness.crossval.validation import validate_folder
-    from mortarbench.reports.validation import write_validation
+    from mortarbench.reports.validation import summary, write_validation
 
     families, reference = registries.families, registries.reference
     with one_thread():
         result = validate_folder(path, families, reference, progress, budget)
-    data = as_data(result, path.resolve().name)
+    data = summary(result, path.resolve().name)
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
         replace_file(path / "validation.json", text.encode())

@@ -1,11 +1,17 @@
-"""Page and table of a cross-validation."""
+"""Summary of a cross-validation as plain data, its page and its table."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from statistics import median
 from typing import Any
 
+from mortarbench.harness.crossval.comparison import Answer, Outcome
+from mortarbench.harness.errors import some
+from mortarbench.harness.record import finite
+from mortarbench.harness.verify.verdicts import plain
 from mortarbench.reports.document import (
     ABSENT,
     Document,
@@ -19,6 +25,7 @@ from mortarbench.reports.document import (
 )
 from mortarbench.reports.writing import write_document
 
+SCHEMA = 2  #: version of the format of the summary
 #: titles of the tables of answers, by outcome
 OUTCOMES = {
     "refuted": "Refuted claims",
@@ -42,6 +49,89 @@ RULES = (
 )
 
 
+def summary(answers: Sequence[Answer], folder: str) -> dict[str, Any]:
+    """Return the summary of a cross-validation, followed by all answers.
+
+    folder : name of the result folder
+
+    Returns
+    -------
+    a dict with
+    agreed : True if no claim is refuted and no certificate is contradicted
+    headline : one or two sentences
+    counts : numbers of distinct stored points (`answers`), of their solvers and cases,
+        and of the answers with each outcome
+    solvers : one dict for each solver and tolerance, see `_row`
+    answers : all answers as dicts, with `Answer.bound`
+
+    """
+    points = [a for a in answers if a.residual is not None]
+    counts = {
+        "answers": len(points),
+        "solvers": len({a.solver for a in points}),
+        "cases": len({a.case for a in points}),
+        **{o.name.lower(): sum(a.outcome is o for a in answers) for o in Outcome},
+    }
+    data = {
+        "schema": SCHEMA,
+        "folder": folder,
+        "agreed": not counts["refuted"] + counts["contradicted"],
+        "headline": _headline(counts, answers),
+        "counts": counts,
+        "solvers": [
+            _row([a for a in answers if (-a.tol, a.solver) == key])
+            for key in sorted({(-a.tol, a.solver) for a in answers})
+        ],
+        "answers": [asdict(a) | {"bound": a.bound} for a in answers],
+    }
+    return dict(finite(plain(data)))
+
+
+def _row(answers: Sequence[Answer]) -> dict[str, Any]:
+    """Summarise the answers of one solver at one tolerance; missing values are None.
+
+    Errors are bounds on the relative error in the energy norm (`Answer.bound`).
+    """
+    errors = [(bound, a.case) for a in answers if (bound := a.bound) is not None]
+    distances = [a.primal_dual for a in answers if a.primal_dual is not None]
+    worst, worst_case = max(errors, default=(None, ""))
+    return {
+        "solver": answers[0].solver,
+        "tol": answers[0].tol,
+        "answers": sum(a.residual is not None for a in answers),
+        "refuted": sum(a.outcome is Outcome.REFUTED for a in answers),
+        "unanswered": sum(a.outcome is Outcome.UNANSWERED for a in answers),
+        "error_median": median(e for e, _ in errors) if errors else None,
+        "error_worst": worst,
+        "worst_case": worst_case,
+        "primal_dual": max(distances, default=None),
+    }
+
+
+def _headline(counts: Mapping[str, int], answers: Sequence[Answer]) -> str:
+    """Return the result of the cross-validation as one or two sentences."""
+    what = _scope(counts)
+    if proven := counts["proven"]:
+        what += f", {plural(proven, 'claim')} of infeasibility proven"
+    culprits = sorted({a.solver for a in answers if a.outcome is Outcome.REFUTED})
+    wrong = []
+    if culprits:
+        claims = plural(counts["refuted"], "refuted claim")
+        wrong.append(f"{claims} of {some(culprits, 6)}")
+    if contradicted := counts["contradicted"]:
+        wrong.append(plural(contradicted, "contradicted certificate"))
+    if wrong:
+        return f"Disagreement: {' and '.join(wrong)}. {what}."
+    return f"No disagreement: {what}; every claim of success stands."
+
+
+def _scope(counts: Mapping[str, int]) -> str:
+    answers, solvers, cases = (
+        plural(counts[f"{noun}s"], noun) for noun in ("answer", "solver", "case")
+    )
+    return f"{answers} of {solvers} to {cases}"
+
+
 def write_validation(directory: Path, data: Mapping[str, Any]) -> list[Path]:
     """Write report/validation.html and .md from the data of `validate`."""
     document = compose(data)
@@ -59,13 +149,9 @@ def compose(data: Mapping[str, Any]) -> Document:
             name = outcome.replace(" ", "-")
             sections.append(Section(name=name, title=title, items=(table,)))
     sections.append(Section(name="rules", title="Rules of the verdict", items=RULES))
-    counts = data["counts"]
-    answers, solvers, cases = (
-        plural(counts[f"{noun}s"], noun) for noun in ("answer", "solver", "case")
-    )
     return Document(
         title=f"Cross-validation of {clean(data['folder'])}",
-        dateline=f"{answers} of {solvers} to {cases}",
+        dateline=_scope(data["counts"]),
         sections=tuple(sections),
         solvers=tuple(dict.fromkeys(d["solver"] for d in data["solvers"])),
     )
