@@ -16,10 +16,9 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import (
@@ -249,16 +248,6 @@ def unbuilt(name: object, e: BaseException) -> str:
         case _:
             why = described(e)
     return " ".join(f"{name} could not be built: {why}".split())
-
-
-def match(pattern: str, names: Iterable[str]) -> list[str]:
-    """Return the canonical `names` that match a shell glob.
-
-    >>> from mortarbench.harness.names import match
-    >>> match("*/dual", ["beam-ring/dual", "beam-ring/primal"])
-    ['beam-ring/dual']
-    """
-    return [name for name in names if fnmatchcase(name, pattern)]
 
 
 def _split_path(text: str, head: str, family: Family) -> tuple[str, list[str]]:

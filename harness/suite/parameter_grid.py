@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from glob import escape, glob
 from itertools import chain, product
 from math import prod
@@ -16,7 +17,7 @@ from msgspec import Meta, Struct
 
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import PLUGINS, InputError, shown, some, unknown
-from mortarbench.harness.names import CaseId, assemble, match, parse, split_row
+from mortarbench.harness.names import CaseId, assemble, parse, split_row
 from mortarbench.harness.plugin import Family
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]+$")]
@@ -97,7 +98,7 @@ class Cases:
             if not set("*?[") & set(pattern):
                 with suppress(InputError):
                     canonical = parse(pattern, families).name
-            matches = match(canonical, names)
+            matches = [name for name in names if fnmatchcase(name, canonical)]
             if not matches:
                 raise InputError(
                     f"cases {pattern!r} matches none of the {len(names)} cases of the "

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mortarbench.harness import DERIVED, Family, InputError, Range
-from mortarbench.harness.names import CaseId, assemble, match, parse
+from mortarbench.harness.names import CaseId, assemble, parse
 from tests.support.refusals import refused
 
 
@@ -132,15 +132,6 @@ def test_a_canonical_name_parses_to_the_case_that_it_names(form, **params):
 def test_an_invalid_name_is_reported_in_one_line(text, message):
     with refused(start=message):
         parse(text, FAMILIES)
-
-
-def test_patterns_are_shell_globs_over_the_whole_name_with_case():
-    names = ["ring/Nh=3/dual", "ring/Nh=13/dual", "ring/Nh=3/primal"]
-
-    assert match("*/dual", names) == names[:2]
-    assert match("ring/Nh=3/*", names) == [names[0], names[2]]
-    assert match("ring/nh=3/*", names) == []
-    assert match("ring/Nh=3", names) == []
 
 
 @dataclass(frozen=True, kw_only=True)

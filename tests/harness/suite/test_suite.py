@@ -235,7 +235,7 @@ def test_patterns_choose_cases_in_the_suite_s_order(demo):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("pattern", ["well", "x*"])
+@pytest.mark.parametrize("pattern", ["well", "x*", "*/N=2/*", "well/n=2"])
 def test_a_pattern_without_cases_is_refused(demo, pattern):
     with pytest.raises(InputError, match="matches none of the 4 cases of the suite"):
         demo.cases.selected(["*", pattern], FAMILIES)
