@@ -45,45 +45,6 @@ cdef class Coarse:
         self.missed = self.y + self.k
         self.active = self.missed + self.original.k
 
-    cdef void times(self, const double *v, double *t) noexcept:
-        """t ← Gv."""
-        self.rows.times(v, t)
-
-    cdef void combine(
-        self, double s, const double *v, double c, const double *y, double *out
-    ) noexcept:
-        """out ← sv + cGᵀy; out may be v."""
-        self.by_components.combine(s, v, c, y, out)
-
-    cdef void weigh_difference(
-        self, const double *v, const double *y, const double *weights, double *out
-    ) noexcept:
-        """out ← weights·(v − Gᵀy), componentwise."""
-        self.by_components.weigh_difference(v, y, weights, out)
-
-    cdef void times_bounded(self, const double *s_b, double *t) noexcept:
-        """t ← G_b s_b with the columns G_b of the components with a bound."""
-        memset(t, 0, self.k * sizeof(double))
-        self.of_bounded.add_transposed(s_b, t)
-
-    cdef void combine_bounded(
-        self, const double *g_b, const double *y, double *out
-    ) noexcept:
-        """out ← g_b + G_bᵀy."""
-        self.of_bounded.combine(1.0, g_b, 1.0, y, out)
-
-    cdef void product(self, const double *y, double *t) noexcept:
-        """t ← GGᵀy."""
-        self.matrix.times(y, t)
-
-    cdef void forward(self, const double *t, double *a) noexcept:
-        """a ← L⁻¹t."""
-        self.factor.forward_to(t, a)
-
-    cdef void backward(self, const double *a, double *y) noexcept:
-        """y ← L⁻ᵀa."""
-        self.factor.backward_to(a, y)
-
     cdef BorderedFactor in_face(self, double shift):
         """Return the factor of G_F G_Fᵀ + shift·GGᵀ; F: all components not `active`."""
         if self.has_border:

@@ -45,8 +45,6 @@ from mortarbench.harness.distributed.sparse cimport (
     BorderedFactor, CompressedRows, LinearMap,
 )
 
-from sys import getrefcount
-
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
@@ -71,8 +69,6 @@ cdef extern from "vectors.h" nogil:
     void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
     void sparse_product(const sparse *F, double s, const double *v, double *y)
     double dot(const double *a, const double *b, Py_ssize_t n)
-    void two_dots(const double *a, const double *b, const double *c, Py_ssize_t n,
-                  double *sums)
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
     void copy_scaled(double s, const double *a, double *b, Py_ssize_t n)

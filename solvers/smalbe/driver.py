@@ -189,9 +189,7 @@ def _projected(qp: QP, options: Options, steps: int, carry: Carry | None) -> Pro
         # q is closer to the first eigenvector than a random vector is; without rows, no
         # step depends on the norm
         find = partial(by_lanczos, steps=steps if qp.b.size else 1, start=qp.q)
-    problem = projected_problem(qp, find, carry and carry.rows_of(qp))
-    problem.preconditioner = kind
-    return problem
+    return projected_problem(qp, find, carry and carry.rows_of(qp))
 
 
 def _estimated_spectrum(
@@ -248,7 +246,9 @@ def _start(task: _Task, tol: float) -> Iterate:
     of this bound has changed: slipping nodes usually continue to slip when the friction
     bound changes. At a solution, ‖𝒫F𝒫‖μ = −Cz.
     """
-    problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
+    problem, carry = task.problem, task.carry
+    # rounding of ρQν in the gradient is below tol
+    rho = min(task.rho, max(1.0, tol / (10 * EPS)))
     if carry is None:
         x, mu = np.zeros(problem.F.n), np.zeros(len(problem.rows.C))
     else:
@@ -258,11 +258,6 @@ def _start(task: _Task, tol: float) -> Iterate:
             z = np.where(np.isinf(task.qp.lb) & np.isinf(task.qp.ub), 0.0, z)
         x = np.where(z, np.copysign(np.inf, z), x)
     return task.loop.first(x, mu, M=task.options.M, rho=rho)
-
-
-def _penalty(rho: float, tol: float) -> float:
-    """Return ρ, limited such that rounding of ρQν in the gradient is below tol."""
-    return min(rho, max(1.0, tol / (10 * EPS)))
 
 
 @dataclass(eq=False)
@@ -302,17 +297,9 @@ class OuterLoop:
 
     def updated(self, at: Iterate) -> Iterate:
         """Return the iterate after the update of the multipliers."""
-        mu, C = self.multipliers(at), self.problem.rows.C
-        return at._replace(mu=mu, g=at.g + C.T @ (mu - at.mu))
-
-    def multipliers(self, at: Iterate) -> Vector:
-        """Return the multipliers μ + ρCν (r,), with which the gradient at ν is g."""
-        return at.mu + at.rho * (self.problem.rows.C @ at.nu)
-
-    def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
-        """Return x, the multipliers a of Cx = Cx̃, z_box and Fx; takes one product."""
-        box = qp.box
-        return self.solver.point(at.nu, at.mu, at.rho, box.lower, box.upper)
+        C = self.problem.rows.C
+        change = at.rho * (C @ at.nu)
+        return at._replace(mu=at.mu + change, g=at.g + C.T @ change)
 
 
 def outer_loop(
@@ -324,9 +311,7 @@ def outer_loop(
         solver = compiled.SMALBE(problem, options, False)
     else:
         own = options.preconditioner_for(qp)
-        kind = problem.preconditioner
-        if kind is None:
-            kind = resolved_preconditioner(qp, options.preconditioner)
+        kind = resolved_preconditioner(qp, options.preconditioner)
         M = structural_preconditioner(qp, kind) if own is None else checked(own)
         rule = options.step_rule_for(qp)
         solver = compiled.SMALBE(problem, options, kind != "none", M, rule)
@@ -356,7 +341,7 @@ def _solve_to_tolerance(
         residuals = _residuals(task, point, Fx, tol)
         worst = max(residuals.gradient, residuals.rows)
         if worst <= tol:
-            return _counted(task, point), partial(_carry, task, point)
+            return point, partial(_carry, task, point)
         waited = 0 if worst < 0.9 * best else waited + 1
         best = min(best, worst)
         if at.status is not Status.SOLVED or waited == MAX_IDLE_TIGHTENINGS:
@@ -372,7 +357,7 @@ def _solve_to_tolerance(
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
     point = replace(point, status=Status.ITERATION_LIMIT, message=message)
-    return _counted(task, point), _nothing
+    return point, _nothing
 
 
 def _tightened(
@@ -408,7 +393,9 @@ def _carry(task: _Task, point: Solution) -> Carry:
 def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     """Recover the solution, and Fx."""
     qp, problem = task.qp, task.problem
-    x, a, z_box, Fx = task.loop.recovered(qp, at)
+    mu, rho, box = at.mu, at.rho, qp.box
+    x, a, z_box, Fx = task.loop.solver.point(at.nu, mu, rho, box.lower, box.upper)
+    problem.F.count += bool(problem.discs)  # `_residuals` takes another product
     letters = at.steps
     counts = {"P_products": problem.F.count, **problem.counts, "outer": len(at.outer)}
     for letter, name in STEPS.items():
@@ -432,17 +419,8 @@ def _residuals(task: _Task, point: Solution, Fx: Vector, tol: float) -> Residual
     """Return the relative KKT residuals of the original QP."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if task.problem.discs:
-        task.problem.F.count += 1
         return Residuals(relative_residual(qp, point, tol))
     return Residuals(*compiled.relative_residuals(qp, point, tol, Fx, diagonal, G))
-
-
-def _counted(task: _Task, point: Solution) -> Solution:
-    """Return `point` with a count that includes the products for residuals."""
-    products = task.problem.F.count
-    if products == point.counts["P_products"]:
-        return point
-    return replace(point, counts={**point.counts, "P_products": products})
 
 
 COLUMNS = (

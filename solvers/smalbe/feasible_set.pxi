@@ -101,7 +101,7 @@ cdef class FeasibleSet:
     cdef void lengths(self, const double *x, const double *g, const double *p,
                       const double *Hp, Line *line) noexcept:
         """Compute the step lengths along x − αp."""
-        two_dots(g, p, Hp, self.n, &line.slope)
+        line.slope, line.curvature = dot(g, p, self.n), dot(p, Hp, self.n)
         line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
         line.feasible = self.feasible_length(x, p, line.cg)
         if line.feasible >= line.cg:

@@ -104,14 +104,13 @@ cdef class Model:
                     high, at_high = t, now
         return Model.of_norm(self.tau + self.largest(), self.n).step(x, g, box, s)
 
-    cdef Model raised(self, const double *s, double square, double sHs):
+    cdef Model raised(self, const double *s, const double *Hs):
         """Return the model with τ increased until sᵀBs ≥ sᵀHs, but at most tenfold.
 
         w + τ is unchanged, except for rows whose weight becomes zero.
-
-        square : ‖s‖²
         """
-        cdef double missing = sHs - self.tau * square, rest = square, tau
+        cdef double rest = dot(s, s, self.n), tau
+        cdef double missing = dot(s, Hs, self.n) - self.tau * rest
         cdef Room Us = Room(self.k)
         cdef Py_ssize_t i
         if self.basis is not None:
@@ -363,7 +362,7 @@ cdef class FactoredBasis(Basis):
             j = self.coarse.bounded[i]
             self.x_b[i], self.g_b[i] = x[j], g[j]
             self.low_b[i], self.high_b[i] = box.lower[j], box.upper[j]
-        self.coarse.times(g, self.Gg)
+        self.coarse.rows.times(g, self.Gg)
         return 0
 
     cdef int newton(self, Model B) except -1:
@@ -376,7 +375,9 @@ cdef class FactoredBasis(Basis):
 
     cdef int minimise_lagrangian(self, Model B, const double *x, const double *g,
                                  FeasibleSet box, double *s) except -1:
-        self.coarse.combine_bounded(self.g_b, self.y_there, self.gradient_b)
+        self.coarse.of_bounded.combine(
+            1.0, self.g_b, 1.0, self.y_there, self.gradient_b
+        )
         model_minimiser(self.x_b, self.gradient_b, B.tau, self.low_b, self.high_b,
                         self.s_b, self.piece_there, self.places)
         return 0
@@ -386,15 +387,16 @@ cdef class FactoredBasis(Basis):
         cdef double *GGy = self.coarse.t
         for i in range(self.places):
             self.gradient_b[i] = self.gradient_b[i] / B.tau + self.s_b[i]
-        self.coarse.times_bounded(self.gradient_b, self.slope_there)
-        self.coarse.product(self.y_there, GGy)
+        memset(self.slope_there, 0, self.k * sizeof(double))
+        self.coarse.of_bounded.add_transposed(self.gradient_b, self.slope_there)
+        self.coarse.matrix.times(self.y_there, GGy)
         for i in range(self.k):
             self.slope_there[i] -= self.Gg[i] / B.tau + (1 / B.tau + 1 / B.w[0]) * GGy[i]
         return 0
 
     cdef int finish(self, Model B, const double *g, double *s) except -1:
         cdef Py_ssize_t i
-        self.coarse.combine(-1 / B.tau, g, -1 / B.tau, self.y_there, s)
+        self.coarse.by_components.combine(-1 / B.tau, g, -1 / B.tau, self.y_there, s)
         for i in range(self.places):
             s[self.coarse.bounded[i]] = self.s_b[i]
         return 0
@@ -410,7 +412,7 @@ cdef class FactoredBasis(Basis):
 
     cdef int inverse(self, Model B, const double *free, const double *v,
                      double *z) except -1:
-        self.coarse.times(v, self.coarse.t)
+        self.coarse.rows.times(v, self.coarse.t)
         self.factor.solve_to(self.coarse.t, self.coarse.y)
-        self.coarse.weigh_difference(v, self.coarse.y, self.weights, z)
+        self.coarse.by_components.weigh_difference(v, self.coarse.y, self.weights, z)
         return 0

@@ -227,7 +227,7 @@ cdef class MPRGP:
     cdef bint knows_Cx
     cdef Line line  # line of the last product
     cdef Parts parts  # of the gradient at x
-    cdef double sums[2]
+    cdef double size  # see `cost`
     cdef double expected_slope  # φᵀz, equal to gᵀp in exact arithmetic
     cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
     cdef double phi_square_at_refresh  # ‖φ‖² at the last `refresh` on this face
@@ -288,6 +288,7 @@ cdef class MPRGP:
         cdef long idle = 0, inside = 0  # number of CG steps on this face
         cdef long check = FIRST_CHECK
         cdef double least = INFINITY, before = INFINITY, cost = INFINITY  # at the last check
+        cdef double now
         cdef int letter
         cdef bint has_expanded = False, begun = True
         cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
@@ -312,10 +313,10 @@ cdef class MPRGP:
                 return 0
             least = fmin(least, self.parts.phi_square + self.parts.beta_square)
             if len(trace) >= check:
-                self.terms_of_cost()
-                if not cost - self.sums[0] > NOISE * self.sums[1] and 4 * least > before:
+                now = self.cost(self.x, self.g)
+                if not cost - now > NOISE * self.size and 4 * least > before:
                     return 0
-                before, least, cost = fmin(least, before), INFINITY, self.sums[0]
+                before, least, cost = fmin(least, before), INFINITY, now
                 check = 2 * len(trace)
             if self.expansion == SPECTRAL and not inside and self.is_settled():
                 # Newton step; φ, `free` and p are recomputed after it.
@@ -510,7 +511,7 @@ cdef class MPRGP:
         if length == 0 or isinf(length):
             return 0
         if self.line.cg < 1:
-            self.raise_model(self.s, self.Hs)
+            self.B = self.B.raised(self.s, self.Hs)
         self.to(length, self.s, self.Hs)
         return 1
 
@@ -526,13 +527,6 @@ cdef class MPRGP:
         scale(-1.0, s, self.n)
         self.lengths_along(s, Hs)
         return fmin(self.line.cg, fmax(1.0, self.line.feasible))
-
-    cdef int raise_model(self, const double *s, const double *Hs) except -1:
-        """Increase the model until sᵀBs ≥ sᵀHs, with the product Hs."""
-        cdef double sums[2]
-        sums[0], sums[1] = dot(s, s, self.n), dot(s, Hs, self.n)
-        self.B = self.B.raised(s, sums[0], sums[1])
-        return 0
 
     # Steps 3 and 4. Spectral steps
 
@@ -594,7 +588,7 @@ cdef class MPRGP:
         """
         cdef Py_ssize_t i, n = self.n
         cdef double before = self.parts.phi_square + self.parts.beta_square
-        cdef double enough, square
+        cdef double enough, square, curvature, length
         cdef long steps = 0
         cdef double *d = self.x2
         cdef const double *z
@@ -617,13 +611,13 @@ cdef class MPRGP:
             self.tangents.conjugate(self.phi, self.p)
             self.H(self.p, self.Hp)
             self.set.follow(self.x, self.g, self.p, self.Hp)
-            self.sums[0] = dot(self.phi, self.p, n)
-            self.sums[1] = dot(self.p, self.Hp, n)
-            if self.sums[1] <= 0:
+            curvature = dot(self.p, self.Hp, n)
+            if curvature <= 0:
                 break
-            add(self.sums[0] / self.sums[1], self.p, d, n)
-            add(-self.sums[0] / self.sums[1], self.Hp, self.phi, n)
-            self.tangents.add(self.p, self.Hp, self.sums[1])
+            length = dot(self.phi, self.p, n) / curvature
+            add(length, self.p, d, n)
+            add(-length, self.Hp, self.phi, n)
+            self.tangents.add(self.p, self.Hp, curvature)
             square = dot(self.phi, self.phi, n)
             trace.append(c"n")
             steps += 1
@@ -632,8 +626,8 @@ cdef class MPRGP:
         for i in range(n):
             self.s[i] = self.x[i] - self.s[i]
         self.H(self.s, self.Hs)
-        self.sums[0], self.sums[1] = dot(self.g, self.s, n), dot(self.s, self.Hs, n)
-        self.line.slope, self.line.curvature = self.sums[0], self.sums[1]
+        self.line.slope = dot(self.g, self.s, n)
+        self.line.curvature = dot(self.s, self.Hs, n)
         if change_along(&self.line, 1.0) >= 0:
             self.split()
             return False
@@ -886,13 +880,10 @@ cdef class MPRGP:
             if change_along(&self.line, 1.0) + change < 0:
                 length = fmax(length, 1.0)
             change += change_along(&self.line, length)
-            self.sums[0] = self.sums[1] = 0.0
-            for i in range(n):  # the rest r of the step beyond z, and rᵀHr
-                r = self.x[i] - s[i] - z[i]
-                self.sums[0] += r * r
-                self.sums[1] += r * (self.g[i] - Hs[i] - z_g[i])
-                z[i] = r
-            self.B = self.B.raised(z, self.sums[0], self.sums[1])
+            for i in range(n):  # the rest r of the step beyond z, and Hr
+                z[i] = self.x[i] - s[i] - z[i]
+                z_g[i] = self.g[i] - Hs[i] - z_g[i]
+            self.B = self.B.raised(z, z_g)
             self.to(length, s, Hs)
         else:
             self.split()
@@ -940,29 +931,22 @@ cdef class MPRGP:
         length = self.searched(self.s, self.Hs)
         if length == 0 or isinf(length):
             return 0
-        self.raise_model(self.s, self.Hs)
+        self.B = self.B.raised(self.s, self.Hs)
         self.to(length, self.s, self.Hs)
         return b"f"
 
     # Step 5. Sums of the stopping tests
 
     cdef double cost(self, const double *x, const double *g) noexcept:
-        """Return xᵀHx − 2bᵀx, twice the cost, computed from the gradient."""
-        cdef double sum_ = 0.0
+        """Return xᵀHx − 2bᵀx, twice the cost, from the gradient; `size` ← Σ|terms|."""
+        cdef double term, sum_ = 0.0
         cdef Py_ssize_t i
+        self.size = 0.0
         for i in range(self.n):
-            sum_ += x[i] * (g[i] - self.rhs[i])
-        return sum_
-
-    cdef void terms_of_cost(self) noexcept:
-        """`sums` ← twice the cost at x, and the sum of |terms| of this cost."""
-        cdef double term, sum_ = 0.0, size = 0.0
-        cdef Py_ssize_t i
-        for i in range(self.n):
-            term = self.x[i] * (self.g[i] - self.rhs[i])
+            term = x[i] * (g[i] - self.rhs[i])
             sum_ += term
-            size += fabs(term)
-        self.sums[0], self.sums[1] = sum_, size
+            self.size += fabs(term)
+        return sum_
 
     cdef double violation(self) except? -1:
         """Return ‖Cx‖ at the iterate; CG steps update Cx without a product."""

@@ -90,10 +90,7 @@ cdef int copy_result(
     array = _whole(result)
     if array.size != n:
         raise ValueError(f"{what} has {array.size} components; expected {n}")
-    if s == 1:
-        memcpy(y, address(array), n * sizeof(double))
-    else:
-        copy_scaled(s, address(array), y, n)
+    copy_scaled(s, address(array), y, n)
     return 0
 
 
@@ -111,7 +108,7 @@ cdef class Product:
     cdef const double *dense
     cdef sparse rows  # `data` is NULL unless P is sparse
     cdef LinearMap map  # P as a compiled linear map, or None
-    cdef object owners, argument
+    cdef object owners
 
     def __cinit__(self, P, Py_ssize_t n):
         self.n, self.matrix = n, P
@@ -168,16 +165,8 @@ cdef class Product:
             self.map.apply(v, y, 1)
             if s != 1:
                 scale(s, y, self.n)
-        # pass a copy of v, because an operator may change its argument or keep a
-        # reference
-        else:
-            # reuse the copy unless the operator keeps a reference, because new memory
-            # causes page faults
-            if self.argument is None or getrefcount(self.argument) > 2:
-                self.argument = np.empty(self.n)
-            memcpy(address(self.argument), v, self.n * sizeof(double))
-            product = self.matrix @ self.argument
-            copy_result(product, self.n, y, "P @ v", s)
+        else:  # a copy, because an operator may change its argument or keep a reference
+            copy_result(self.matrix @ copied(v, self.n), self.n, y, "P @ v", s)
         return 0
 
 
@@ -219,8 +208,8 @@ cdef class Rows:
         if self.C:
             rows_times(self.C, v, Cv, self.r, self.n)
         elif self.exist:
-            self.coarse.times(v, self.coarse.t)
-            self.coarse.forward(self.coarse.t, Cv)
+            self.coarse.rows.times(v, self.coarse.t)
+            self.coarse.factor.forward_to(self.coarse.t, Cv)
         return 0
 
     cdef int combine(
@@ -232,8 +221,8 @@ cdef class Rows:
         if self.C:
             add_combination(s, self.C, a, y, self.r, self.n)
         elif self.exist:
-            self.coarse.backward(a, self.coarse.y)
-            self.coarse.combine(1.0, y, s, self.coarse.y, y)
+            self.coarse.factor.backward_to(a, self.coarse.y)
+            self.coarse.by_components.combine(1.0, y, s, self.coarse.y, y)
         return 0
 
     cdef int add(self, double s, const double *a, double *y) except -1:
@@ -293,14 +282,16 @@ cdef class Rows:
         cdef Room room
         cdef double *S
         cdef double *t
+        if not self.exist:
+            return 0
         masked(free, r, r, self.n)
         if self.coarse is not None:
-            self.coarse.times(r, self.coarse.t)
+            self.coarse.rows.times(r, self.coarse.t)
             self.coarse.enter(free)
             self.coarse.in_face(FREE_RANK).solve_to(self.coarse.t, self.coarse.y)
             scale(-1.0, self.coarse.y, self.r)
-            self.coarse.product(self.coarse.y, self.coarse.t)
-            self.coarse.forward(self.coarse.t, a)
+            self.coarse.matrix.times(self.coarse.y, self.coarse.t)
+            self.coarse.factor.forward_to(self.coarse.t, a)
             return 0
         room = Room((self.r + 1) * (self.r + self.n))
         S, t = room.at, room.at + self.r * self.r

@@ -16,7 +16,6 @@ from mortarbench.harness.operators import is_semidefinite
 from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.compiled import Product
-from mortarbench.solvers.smalbe.preconditioner import Preconditioner
 from mortarbench.solvers.smalbe.rows import (
     Rows,
     SparseRows,
@@ -48,8 +47,6 @@ class Projected:
     diagonal: Vector  #: diagonal of F; empty for an operator F without a known diagonal
     #: counts of operations other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
-    #: preconditioner on the face; None to use the option `preconditioner`
-    preconditioner: Preconditioner | None = None
     #: incomplete factor of the free block of a sparse F, or None
     factor: compiled.IncompleteFactor | None = None
     discs: tuple[Discs, ...] = ()  #: discs of x, not of ν

@@ -1,16 +1,6 @@
 # Proportioning with an incomplete factor of the free block of P.
 
 
-cdef double gain_of_projection(MPRGP at) noexcept:
-    """Return a lower bound on the decrease of the cost in the step to Π(x − g/τ).
-
-    With the projection Π onto the set, s = Π(x − g/τ) − x and τ ≥ ‖H‖, the bound is
-    −gᵀs/2, because gᵀs ≤ −τ‖s‖².
-    """
-    at.set.minimise(at.x, at.g, at.B.tau, at.s)
-    return -0.5 * dot(at.g, at.s, at.n)
-
-
 cdef bint step_by_factor(MPRGP at) except -1:
     """Release components at bounds and step with the factor of the enlarged free set.
 
@@ -26,15 +16,18 @@ cdef bint step_by_factor(MPRGP at) except -1:
     Therefore neighbours in the graph of P, up to a distance of `layers` edges, are also
     released; a neighbour that the step would move out of the set stays at its bound. If
     at least half of the neighbours leave their bounds, the number of layers is doubled,
-    otherwise halved. The number is reset to zero after an expansion. The step is
-    accepted only if the cost decreases by at least `gain_of_projection`; otherwise a
-    gradient projection step is taken, which costs one more product.
+    otherwise halved. The number is reset to zero after an expansion. With τ ≥ ‖H‖ and
+    p = Π(x − g/τ) − x, the step to x + p would decrease the cost by at least −gᵀp/2,
+    because gᵀp ≤ −τ‖p‖². A step that achieves less is replaced by a gradient projection
+    step, which costs one more product.
     """
     cdef Py_ssize_t i, count = 0, released, freed = 0, n = at.n
     cdef IncompleteFactor factor = at.factor
     cdef double *wide = factor.wanted
     cdef double *beta = at.t
-    cdef double least = gain_of_projection(at), length
+    cdef double least, length
+    at.set.minimise(at.x, at.g, at.B.tau, at.s)
+    least = -0.5 * dot(at.g, at.s, n)
     memcpy(wide, at.free, n * sizeof(double))
     at.set.project_gradient(at.x, at.g, beta)
     add(-1.0, at.phi, beta, n)

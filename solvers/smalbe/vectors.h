@@ -110,18 +110,6 @@ CLONED static double dot(const double *a, const double *b, Py_ssize_t n)
     return total;
 }
 
-/* sums = bᵀa, bᵀc. */
-CLONED static void two_dots(in a, in b, in c, Py_ssize_t n, out sums)
-{
-    double first = 0, second = 0;
-    for (Py_ssize_t i = 0; i < n; i++) {
-        first += a[i] * b[i];
-        second += b[i] * c[i];
-    }
-    sums[0] = first;
-    sums[1] = second;
-}
-
 /* b = b + s a. */
 CLONED static void add(double s, in a, out b, Py_ssize_t n)
 {
