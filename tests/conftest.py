@@ -214,3 +214,23 @@ def blank_figures(blank):
     """Draw the figures of reports empty."""
     with blank():
         yield
+
+
+@pytest.fixture
+def command(capsys, monkeypatch, tmp_path):
+    """Return a function that runs a command line in the folder of the test.
+
+    It takes the words of the command, and perhaps registries that replace those of the
+    product, and returns the exit code, stdout and stderr. The machine appears idle.
+    """
+    from mortarbench.cli.main import main  # slow; few processes need it
+    from mortarbench.registries import Registries
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+
+    def command(*words, registries=None):
+        code = main(registries or Registries(), [*map(str, words)])
+        return code, *capsys.readouterr()
+
+    return command

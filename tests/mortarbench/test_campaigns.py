@@ -8,7 +8,6 @@ import signal
 import pytest
 
 import mortarbench as mb
-from mortarbench.cli.main import main
 from mortarbench.harness.files.store import is_stored
 from mortarbench.harness.results.folder import environment_of
 from mortarbench.harness.results.journal import read_journal
@@ -316,21 +315,8 @@ def read_all(results):
 # commands of CI jobs
 
 
-@pytest.fixture
-def cli(tmp_path, capsys, monkeypatch):
-    """Run a command line in the folder of the test; return code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def cli(*argv):
-        code = main(Registries(), [str(word) for word in argv])
-        streams = capsys.readouterr()
-        return code, streams.out, streams.err
-
-    return cli
-
-
 def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
-    cli, tmp_path, monkeypatch
+    command, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(mb, "report", lambda *_, **__: mb.Report(files=()))
     asked = ("run", "s.toml", "--plugin", TOY_PROBLEM, "--repeats", 1)
@@ -338,7 +324,7 @@ def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
         suite('"exact", "picky", "liar", "lost"', depths="2")
     )
 
-    code, out, _ = cli(*asked, "--strict")
+    code, out, _ = command(*asked, "--strict")
     assert code == 1
     assert out.splitlines()[-1] == (
         "strict: measurements: 1 refuted (liar on well/depth=2/dual) and 1 without an "
@@ -346,9 +332,9 @@ def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
     )
     good = (*asked, "--solver", "exact", "--solver", "picky")
     assert (
-        cli(*good, "--strict")[0] == 0
+        command(*good, "--strict")[0] == 0
     )  # one declined; other solvers are not selected
-    code, out, _ = cli(*asked, "--strict", "--json")
+    code, out, _ = command(*asked, "--strict", "--json")
     told = json.loads(out)
     assert code == 1
     assert told["solvers"]["exact"] == {"verified": 1}
@@ -361,7 +347,7 @@ def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
 
 @pytest.mark.usefixtures("blank_figures")
 def test_a_report_fails_on_the_requested_conditions_and_says_so(
-    cli, measure, tmp_path, monkeypatch
+    command, measure, tmp_path, monkeypatch
 ):
     """A solver that sleeps takes ten times as long in folder b; another solver makes a
     false claim in folder c.
@@ -377,57 +363,59 @@ def test_a_report_fails_on_the_requested_conditions_and_says_so(
         solvers = f"{slow.format('new', seconds)}, {old}"
         measure(name, solvers=solvers, depths="2, 3, 4")
 
-    assert cli("report", "a", "b", "--fail-on", "worse", "--format", "csv")[0] == 0
+    assert command("report", "a", "b", "--fail-on", "worse", "--format", "csv")[0] == 0
     gates = ("--fail-on", "worse,slower=1.5", "--format", "csv", "--json")
-    code, out, _ = cli("report", "a", "b", *gates)
+    code, out, _ = command("report", "a", "b", *gates)
     told = json.loads(out)
     assert (code, told["failed_on"]) == (1, ["slower"])
     new, old = told["changes"]
     assert (new["after"], new["outcome"], new["cells"]) == ("new", "slower", 3)
     assert new["low"] > 1.5
     assert (old["after"], old["outcome"], old["worse"]) == ("old", "not_slower", [])
-    code, out, _ = cli("report", "a", "b", "c", "--fail-on", "worse", "--format", "md")
+    code, out, _ = command(
+        "report", "a", "b", "c", "--fail-on", "worse", "--format", "md"
+    )
     assert code == 1
     assert out.splitlines()[-1] == "failed on worse"
     assert "c/report/against-a/report.md" in out
     assert "worse: old on 3 cells, such as well/depth=2/dual: verified →" in out
-    assert cli("report", "a", "c", "--format", "csv")[0] == 0  # without --fail-on
+    assert command("report", "a", "c", "--format", "csv")[0] == 0  # without --fail-on
 
 
-def test_two_solvers_of_one_run_are_compared(cli, measure, tmp_path, monkeypatch):
+def test_two_solvers_of_one_run_are_compared(command, measure, tmp_path, monkeypatch):
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
     slow = '{{ name = "slow", label = "{}", options.seconds = {} }}'
     solvers = f"{slow.format('old', 0.02)}, {slow.format('new', 0.05)}"
     measure("a", solvers=solvers, depths="2, 3", repeats=3)
     asked = ("--format", "csv", "--fail-on", "slower=1.2")
 
-    code, out, _ = cli("report", "a", "--compare", "old,new", *asked)
+    code, out, _ = command("report", "a", "--compare", "old,new", *asked)
     assert code == 1
     assert out.startswith("Changed: new.seconds 0.02 → 0.05.\nslower: new")
-    assert cli("report", "a", "--compare", "new,old", *asked)[0] == 0
-    assert cli("report", "a", "a", "--pair", "old=new", *asked)[0] == 1
+    assert command("report", "a", "--compare", "new,old", *asked)[0] == 0
+    assert command("report", "a", "a", "--pair", "old=new", *asked)[0] == 1
 
 
 def test_conditions_that_cannot_be_judged_exit_with_2_and_the_reason(
-    cli, stored, measure
+    command, stored, measure
 ):
-    code, _, err = cli("report", "a", "--fail-on", "worse")
+    code, _, err = command("report", "a", "--fail-on", "worse")
     assert code == 2
     assert "fail-on and pair need two folders, or two solvers" in err
-    code, out, _ = cli("report", "a", "b", "--fail-on", "slower")
+    code, out, _ = command("report", "a", "b", "--fail-on", "slower")
     assert code == 2
     assert "cannot tell: exact has no cell that was verified both times" in out
-    code, _, err = cli("report", "a", "b", "--fail-on", "slowr")
+    code, _, err = command("report", "a", "b", "--fail-on", "slowr")
     assert (code, "expected worse, slower, or slower=FACTOR" in err) == (2, True)
-    code, _, err = cli("report", "a", "--compare", "exact,lx", "--format", "csv")
+    code, _, err = command("report", "a", "--compare", "exact,lx", "--format", "csv")
     assert (code, "did you mean 'lax'" in err) == (2, True)
 
 
-def test_folders_are_merged_from_the_command_line(cli, stored):
-    code, out, _ = cli("merge", "a", "b", "--out", "all")
+def test_folders_are_merged_from_the_command_line(command, stored):
+    code, out, _ = command("merge", "a", "b", "--out", "all")
     assert code == 0
     assert out.splitlines()[-1] == "all: 8 measurements"
-    code, out, err = cli("merge", "a", "nowhere", "--out", "more")
+    code, out, err = command("merge", "a", "nowhere", "--out", "more")
     assert (code, out) == (2, "")
     assert "nowhere: no such folder; expected a result folder of `run`" in err
 
@@ -454,13 +442,13 @@ def contents(folder):
     ],
 )
 def test_a_merge_into_one_of_its_sources_is_refused_in_one_line(
-    cli, stored, tmp_path, out, said
+    command, stored, tmp_path, out, said
 ):
     a, b = stored
     (tmp_path / "link").symlink_to(a)
     before = contents(a), contents(b)
 
-    code, printed, err = cli("merge", "a", "b", "--out", out)
+    code, printed, err = command("merge", "a", "b", "--out", out)
 
     assert (code, printed) == (2, "")
     assert len(err.splitlines()) == 1

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.progress import display_on
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM, WRITE_REPORT
+from tests.support.toy_registries import toy_registries
 
 SOLVERS = load_plugin(TOY_PROBLEM).solvers
 FAMILIES = load_plugin(TOY_PROBLEM).problems
@@ -35,28 +37,14 @@ def registries(tmp_path):
         "# For tests.\nname = 'tiny'\nsolvers = ['exact']\n"
         "[[problems]]\nfamily = 'well'\n"
     )
-    return Registries(
-        families=FAMILIES,
-        solvers=SOLVERS,
-        reference=lambda qp: SOLVERS["exact"].prepare(qp, 0.0)(),
-        suites=suites,
-        start=(sys.executable, "-P", str(TOY_PROBLEM)),
-    )
+    return toy_registries(lambda qp: SOLVERS["exact"].prepare(qp, 0.0)(), suites=suites)
 
 
 @pytest.fixture
-def cli(registries, capsys, monkeypatch, tmp_path):
-    """Run a command line in an empty folder; return its code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
+def cli(registries, command, monkeypatch):
+    """Run a command line with the toy problem in an empty folder."""
     monkeypatch.setattr(WRITE_REPORT, report)
-    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
-
-    def cli(*argv):
-        code = main(registries, [str(word) for word in argv])
-        streams = capsys.readouterr()
-        return code, streams.out, streams.err
-
-    return cli
+    return partial(command, registries=registries)
 
 
 def test_problems_are_listed_with_defaults_and_forms(cli):

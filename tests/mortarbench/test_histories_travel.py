@@ -6,13 +6,10 @@ bounds are active and g = −(1, 1, 1), to the minimiser x = (1, 1, 1) in one st
 """
 
 import json
-import os
-import sys
 
 import numpy as np
 import pytest
 
-from mortarbench.cli.main import main
 from mortarbench.harness import Solution, Status
 from mortarbench.harness.conformance.manufactured import manufactured as drawn
 from mortarbench.harness.files.store import (
@@ -21,10 +18,10 @@ from mortarbench.harness.files.store import (
 from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.verify.measure import measure
-from mortarbench.registries import Registries
 from mortarbench.text import convergence
-from tests.support import HISTORIES, TOY_PROBLEM, WRITE_REPORT, no_report
+from tests.support import HISTORIES, WRITE_REPORT, no_report
 from tests.support.stored import save_solution
+from tests.support.toy_registries import toy_registries
 
 PLUGIN = load_plugin(HISTORIES)
 TOLD = {
@@ -40,27 +37,14 @@ def unsolved(qp):
 
 
 @pytest.fixture
-def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line that loads both plug-ins; return its code, stdout
-    and stderr.
-    """
-    monkeypatch.chdir(tmp_path)
+def cli(command, monkeypatch):
+    """Run a command line that loads both plug-ins."""
     monkeypatch.setattr(WRITE_REPORT, no_report)
-    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
-    toy = load_plugin(TOY_PROBLEM)
-    nothing = {}
-    registries = Registries(
-        families=toy.problems, solvers=toy.solvers,
-        start=(sys.executable, "-P", str(TOY_PROBLEM)),
-        reference=unsolved, **nothing,
-    )  # fmt: skip
 
-    def cli(command, *argv):
-        words = [command, *argv, "--plugin", str(HISTORIES)]
-        code = main(registries, words)
-        streams = capsys.readouterr()
-        return code, streams.out, streams.err
+    def cli(*words):
+        return command(*words, "--plugin", HISTORIES, registries=registries)
 
+    registries = toy_registries(unsolved)
     return cli
 
 

@@ -1,13 +1,11 @@
 """Tasks of solver authors: sweeps, comparison of versions, file templates."""
 
 import json
-import os
-import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from mortarbench.cli.main import main
 from mortarbench.harness.conformance.conformance import (
     CHECKS,
     INVARIANCE_PREFIX,
@@ -21,9 +19,14 @@ from mortarbench.progress import waiting
 from mortarbench.registries import Registries
 from mortarbench.validation import Conformance
 from tests.support import TOY_PROBLEM, WRITE_REPORT, no_report
+from tests.support.toy_registries import toy_registries
 from tests.support.waiting import soon
 
-TOY = load_plugin(TOY_PROBLEM)
+
+def exact(qp):
+    """Solve a QP of the toy problem."""
+    return load_plugin(TOY_PROBLEM).solvers["exact"].prepare(qp, 0.0)()
+
 
 #: solver that is correct only in the second version; the versions differ in `step`
 MINE = """
@@ -53,21 +56,10 @@ SOLVERS = {"mine": Mine()}
 
 
 @pytest.fixture
-def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line in an empty folder; return its code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
+def cli(command, monkeypatch):
+    """Run a command line with the toy problem in an empty folder."""
     monkeypatch.setattr(WRITE_REPORT, no_report)
-    registries = Registries(
-        families=TOY.problems,
-        solvers=TOY.solvers,
-        reference=lambda qp: TOY.solvers["exact"].prepare(qp, 0.0)(),
-        start=(sys.executable, "-P", str(TOY_PROBLEM)),
-    )
-
-    def cli(*argv):
-        return main(registries, [*map(str, argv)]), *capsys.readouterr()
-
-    return cli
+    return partial(command, registries=toy_registries(exact))
 
 
 @pytest.fixture
@@ -158,26 +150,12 @@ def test_a_single_solve_accepts_options(cli, versions):
 # templates
 
 
-@pytest.fixture
-def starting(capsys, monkeypatch, tmp_path):
-    """Run the command line with all built-in solvers and problems in an
-    empty folder.
-    """
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
-
-    def run(*argv):
-        return main(Registries(), [*map(str, argv)]), *capsys.readouterr()
-
-    return run
-
-
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
 ONE_PER_KIND = list({check.partition(":")[0]: check for check in STRICT}.values())
 
 
-def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
-    code, out, err = starting("new", "solver", "my-own")
+def test_a_new_solver_passes_the_conformance_suite_as_it_is(command):
+    code, out, err = command("new", "solver", "my-own")
     solver = load_plugin("my-own.py").solvers["my-own"]
     results = {check: run_check(check, solver) for check in ONE_PER_KIND}
 
@@ -189,26 +167,26 @@ def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
     assert declined == {c for c in ONE_PER_KIND if "sequence" in c} | over_sets
 
 
-def test_a_new_problem_builds_the_named_case(starting):
+def test_a_new_problem_builds_the_named_case(command):
     """−u″ = −1 outside of the contact zone, and u = −depth = −0.05 in the zone; its
     distance from both ends is √(2·depth).
     """
-    starting("new", "problem", "mine")
+    command("new", "problem", "mine")
     name = "mine/n=399/primal"
     solve = ("solve", name, "--solver", "clarabel", "--plugin", "mine.py", "--json")
-    code, out, err = starting(*solve)
+    code, out, err = command(*solve)
     quantities = json.loads(out)["quantities"]
 
     assert code == 0, err
     assert quantities["lowest"] == pytest.approx(-0.05, rel=1e-6)
     assert quantities["touching"] / 400 == pytest.approx(1 - 2 * 0.1**0.5, abs=0.01)
-    assert starting(*solve[:1], "mine/n=1/primal", *solve[2:])[2] == (
+    assert command(*solve[:1], "mine/n=1/primal", *solve[2:])[2] == (
         "mortarbench: mine: n=1 must be at least 2\n"
     )
 
 
-def test_a_new_suite_is_one_of_known_solvers_and_cases(starting):
-    starting("new", "suite", "mine")
+def test_a_new_suite_is_one_of_known_solvers_and_cases(command):
+    command("new", "suite", "mine")
     registries = Registries()
     suite = load_suite(Path("mine.toml"), registries.families, registries.solvers)
 
@@ -218,26 +196,26 @@ def test_a_new_suite_is_one_of_known_solvers_and_cases(starting):
 
 
 @pytest.mark.slow
-def test_a_new_suite_runs(starting):
-    starting("new", "suite", "mine")
+def test_a_new_suite_runs(command):
+    command("new", "suite", "mine")
 
-    assert starting("run", "mine.toml", "--repeats", "1")[0] == 0
+    assert command("run", "mine.toml", "--repeats", "1")[0] == 0
     assert {str(r.status) for r in read_journal(Path("out/mine"))} <= {
         "verified", "declined", "inaccurate"
     }  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", ["solver", "problem", "suite"])
-def test_existing_files_are_not_overwritten(starting, tmp_path, kind):
+def test_existing_files_are_not_overwritten(command, tmp_path, kind):
     name = "mine.toml" if kind == "suite" else "mine.py"
     (tmp_path / name).write_text("precious")
     (tmp_path / "other.py").symlink_to("gone")
-    code, out, err = starting("new", kind, "mine")
+    code, out, err = command("new", kind, "mine")
 
     assert (code, out) == (2, "")
     assert err == (f"mortarbench: {name} exists already; expected another name\n")
     assert (tmp_path / name).read_text() == "precious"
-    assert starting("new", "solver", "other")[0] == 2
+    assert command("new", "solver", "other")[0] == 2
     assert not (tmp_path / "gone").exists()
 
 
@@ -257,8 +235,8 @@ def test_existing_files_are_not_overwritten(starting, tmp_path, kind):
         (("familie", "b"), "unknown kind 'familie'; known: problem, solver, suite"),
     ],
 )
-def test_an_invalid_name_is_refused(starting, tmp_path, words, message):
-    code, _, err = starting("new", *words)
+def test_an_invalid_name_is_refused(command, tmp_path, words, message):
+    code, _, err = command("new", *words)
 
     assert code == 2
     assert err.startswith(f"mortarbench: {message}")

@@ -8,8 +8,8 @@ import errno
 import os
 import resource
 import signal
-import sys
 from contextlib import contextmanager
+from functools import partial
 
 import pytest
 
@@ -23,9 +23,9 @@ from mortarbench.harness.files.durable import (
     report_full_disk,
 )
 from mortarbench.harness.processes import measurement as remote
-from mortarbench.harness.registry import load_plugin
 from mortarbench.registries import Registries
-from tests.support import TOY_PROBLEM, WRITE_REPORT, no_report
+from tests.support import WRITE_REPORT, no_report
+from tests.support.toy_registries import toy_registries
 
 
 @contextmanager
@@ -126,27 +126,13 @@ forms = ["dual"]
 
 
 @pytest.fixture
-def cli(capsys, monkeypatch, tmp_path):
+def cli(command, monkeypatch, tmp_path):
     """Return a function that runs a command line on the toy problem in a folder that
-    contains only a suite; it returns the exit code, stdout and stderr.
+    contains only a suite.
     """
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(WRITE_REPORT, no_report)
     (tmp_path / "toy.toml").write_text(SUITE)
-    plugin = load_plugin(TOY_PROBLEM)
-    nothing = {"reference": None}
-    registries = Registries(
-        families=plugin.problems,
-        solvers=plugin.solvers,
-        start=(sys.executable, "-P", str(TOY_PROBLEM)),
-        **nothing,
-    )
-
-    def cli(*argv):
-        code = main(registries, argv)
-        return code, *capsys.readouterr()
-
-    return cli
+    return partial(command, registries=toy_registries())
 
 
 def test_a_run_states_measurements_prevented_by_faults(cli, monkeypatch, tmp_path):

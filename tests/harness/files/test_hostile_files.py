@@ -16,16 +16,12 @@ import pytest
 from scipy.io import savemat
 from scipy.sparse import csc_matrix
 
-from mortarbench.cli.main import main
 from mortarbench.harness import QP, InputError, no_rows
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.files.reading import VARIABLE
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.mesh_files.reading import read_msh
-from mortarbench.registries import Registries
-from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.damaged_files import QPS, fuzz, tiny_qp
 
 ADDRESS_SPACE = 2**29  #: additional bytes of address space for a refusal
@@ -46,19 +42,6 @@ def cheaply():
     resource.setrlimit(resource.RLIMIT_AS, (used + ADDRESS_SPACE, hard))
     yield
     resource.setrlimit(resource.RLIMIT_AS, before)
-
-
-@pytest.fixture
-def command(capsys):
-    """Run the command line; return exit code, stdout and stderr."""
-    bench = Registries(
-        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-    )  # fmt: skip
-
-    def run(*arguments):
-        return main(bench, [str(a) for a in arguments]), *capsys.readouterr()
-
-    return run
 
 
 # data that would execute code

@@ -5,7 +5,6 @@ import os
 import numpy as np
 import pytest
 
-from mortarbench.cli.main import main
 from mortarbench.harness import InputError, Record, Verdict
 from mortarbench.harness.files.store import (
     load_fields,
@@ -13,10 +12,6 @@ from mortarbench.harness.files.store import (
     save,
 )
 from mortarbench.harness.results.journal import Journal
-from mortarbench.problems import PROBLEMS
-from mortarbench.registries import Registries
-from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.reference.solve import reference_solution
 from tests.harness.files.test_hostile_files import hostile
 
 SUITE = 'name = "s"\nsolvers = ["clarabel"]\n[[problems]]\nfamily = "file"\n'
@@ -53,21 +48,6 @@ def sent(tmp_path):
         return folder
 
     return write
-
-
-@pytest.fixture
-def command(capsys, monkeypatch, tmp_path):
-    """Run the command line; return exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
-    bench = Registries(
-        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-    )  # fmt: skip
-
-    def run(*arguments):
-        return main(bench, [str(a) for a in arguments]), *capsys.readouterr()
-
-    return run
 
 
 def everything(folder):

@@ -2,8 +2,8 @@
 
 import json
 import shutil
-import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,6 +14,7 @@ from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
+from tests.support.toy_registries import toy_registries
 
 #: all tests replay the same run, in one process
 pytestmark = pytest.mark.together
@@ -36,13 +37,7 @@ params = { depth = [1, 2] }
 
 @pytest.fixture(scope="module")
 def registries():
-    nothing = {"reference": None}
-    return Registries(
-        families=PLUGIN.problems,
-        solvers=PLUGIN.solvers,
-        start=(sys.executable, "-P", str(TOY_PROBLEM)),
-        **nothing,
-    )
+    return toy_registries()
 
 
 @pytest.fixture(scope="module")
@@ -56,18 +51,8 @@ def finished(registries, tmp_path_factory):
 
 
 @pytest.fixture
-def cli(registries, capsys, monkeypatch, tmp_path):
-    """Return a function that runs a command line in the folder of the test.
-
-    The function returns the exit code, stdout and stderr.
-    """
-    monkeypatch.chdir(tmp_path)
-
-    def cli(*argv, registries=registries):
-        code = main(registries, argv)
-        return code, *capsys.readouterr()
-
-    return cli
+def cli(registries, command):
+    return partial(command, registries=registries)
 
 
 @pytest.fixture

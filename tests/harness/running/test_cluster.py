@@ -8,19 +8,19 @@ import subprocess
 import sys
 import threading
 from contextlib import contextmanager, suppress
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-from mortarbench.cli.main import main
 from mortarbench.harness import InputError
 from mortarbench.harness.environment.environment import capture, digest
 from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.folder import environment_of
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.registries import Registries
 from tests.support import ROOT, TOY_PROBLEM, WRITE_REPORT, no_report
+from tests.support.toy_registries import toy_registries
 from tests.support.waiting import soon
 
 if find_spec("distributed") is None:
@@ -102,28 +102,14 @@ def cluster(tmp_path, forks):
 
 
 @pytest.fixture
-def cli(capsys, monkeypatch, tmp_path):
+def cli(command, monkeypatch, tmp_path):
     """Return a function that runs a command line on the toy problem in a folder with a
-    suite; it returns the exit code, stdout and stderr.
+    suite.
     """
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(WRITE_REPORT, no_report)
-    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
     (tmp_path / "toy.toml").write_text(suite_of(CASES))
-    nothing = {"reference": None}
-    registries = Registries(
-        families=PLUGIN.problems,
-        solvers=PLUGIN.solvers,
-        start=(sys.executable, "-P", str(TOY_PROBLEM)),
-        **nothing,
-    )
-
-    def cli(*argv):
-        code = main(registries, argv)
-        return code, *capsys.readouterr()
-
-    return cli
+    return partial(command, registries=toy_registries())
 
 
 def measured(folder):

@@ -19,7 +19,6 @@ from scipy.sparse import (
     vstack,
 )
 
-from mortarbench.cli.main import main
 from mortarbench.harness import QP, InputError
 from mortarbench.harness.files.qpfile import explicit_matrices
 from mortarbench.harness.names import assemble, parse
@@ -30,7 +29,6 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.problems.files.qps import parse_qps, save_qps
 from mortarbench.problems.files.readers import read
 from mortarbench.problems.files.two_sided import loaded
-from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.cases import built
@@ -589,20 +587,6 @@ def test_the_error_for_a_missing_path_states_the_syntax(text):
 
 
 # export and back
-
-
-@pytest.fixture
-def command(capsys):
-    """Return a function that runs the command line and returns exit code, stdout and
-    stderr."""
-    bench = Registries(
-        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-    )  # fmt: skip
-
-    def run(*arguments):
-        return main(bench, arguments), *capsys.readouterr()
-
-    return run
 
 
 SMALL = "beam-ring/Nr=2/Nh=1/steps=2"

@@ -8,13 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from mortarbench.cli.main import main
 from mortarbench.harness import ContactSide, Fields, InputError
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.files.store import field_arrays, load_fields, save
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.registries import Registries
 from mortarbench.reports.export.vtu import write_series, write_vtu
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
@@ -229,16 +227,13 @@ def test_friction_on_open_nodes_does_not_count_as_contact(tmp_path):
 
 
 @pytest.fixture
-def solve(tmp_path, capsys):
+def solve(tmp_path, command):
     """Solve a case with --vtu; return exit code, stderr and the file."""
-    bench = Registries(
-        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-    )  # fmt: skip
 
     def solve(case, name="a.vtu"):
         path = tmp_path / name
-        code = main(bench, ["solve", case, "--solver", "clarabel", "--vtu", str(path)])
-        return code, capsys.readouterr().err, path
+        code, _, err = command("solve", case, "--solver", "clarabel", "--vtu", path)
+        return code, err, path
 
     return solve
 
