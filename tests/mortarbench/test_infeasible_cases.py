@@ -5,7 +5,6 @@ import json
 import pytest
 
 import mortarbench as mb
-from mortarbench.cli.main import main as command_line
 from mortarbench.harness import Verdict
 from mortarbench.harness.conformance.manufactured import (
     infeasible,
@@ -13,12 +12,7 @@ from mortarbench.harness.conformance.manufactured import (
     unbounded,
 )
 from mortarbench.harness.files.qpfile import save_qp
-from mortarbench.registries import Registries
 from mortarbench.reports.measurements import read_measurements
-
-
-def main(argv):
-    return command_line(Registries(), argv)
 
 
 @pytest.fixture
@@ -45,23 +39,21 @@ def write(folder, *names):
     return str(path)
 
 
-def test_solve_reports_verified_infeasibility(qps, capsys):
-    assert main(["solve", f"file:{qps}/none.npz", "--solver", "osqp"]) == 0
-    assert "verified infeasible (claimed infeasible)" in capsys.readouterr().out
-    assert main(["solve", f"file:{qps}/none.npz", "--solver", "osqp", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["status"] == "verified_infeasible"
-
-
-def test_a_claim_that_the_objective_is_unbounded_is_verified(qps, capsys):
-    assert main(["solve", f"file:{qps}/far.npz", "--solver", "osqp", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["status"] == "verified_unbounded"
+@pytest.mark.parametrize(
+    ("name", "status"), [("none", "verified_infeasible"), ("far", "verified_unbounded")]
+)
+def test_solve_verifies_claims(qps, command, name, status):
+    solve = ("solve", f"file:{qps}/{name}.npz", "--solver", "osqp")
+    code, out, _ = command(*solve, "--json")
+    assert (code, json.loads(out)["status"]) == (0, status)
+    assert f"{status.replace('_', ' ')} (claimed " in command(*solve)[1]
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_verified_infeasibility_passes_a_strict_run(qps, tmp_path, capsys):
+def test_verified_infeasibility_passes_a_strict_run(qps, tmp_path, command):
     out = tmp_path / "out"
     path = write(qps, "none", "some")
-    assert main(["run", path, "--out", str(out), "--strict"]) == 0
+    assert command("run", path, "--out", out, "--strict")[0] == 0
     found = mb.load(out)
     assert not found.refuted
     assert not found.failed
@@ -70,31 +62,23 @@ def test_verified_infeasibility_passes_a_strict_run(qps, tmp_path, capsys):
     for factor in (10.0, 0.01, 1e4):
         answers = read_measurements(out, factor).answers
         assert [*answers[answers.case.str.contains("none")].verified] == [True] * 2
-    assert main(["validate", str(out)]) == 0
-    capsys.readouterr()
-    main(["report", str(out), "--format", "md"])
+    code, said, _ = command("validate", out)
+    assert code == 0
+    assert "2 claims of infeasibility proven" in said
+    command("report", out, "--format", "md")
     page = (out / "report" / "report.md").read_text()
     assert "4 answers verified, 0 claims refuted" in page
 
 
-def test_a_folder_of_infeasible_cases_is_validated_and_forged_proofs_detected(
-    qps, tmp_path, capsys
-):
-    out = tmp_path / "out"
-    main(["run", write(qps, "none"), "--out", str(out)])
-    capsys.readouterr()
-    assert main(["validate", str(out)]) == 0
-    assert "2 claims of infeasibility proven" in capsys.readouterr().out
-
+def test_forged_proofs_of_infeasibility_are_detected(qps, tmp_path, command):
     forged = tmp_path / "forged"
-    main(["run", write(qps, "some"), "--out", str(forged)])
+    command("run", write(qps, "some"), "--out", forged)
     (journal,) = (forged / "journal").glob("*.jsonl")
     lines = journal.read_text()
     for true, false in (("solved", "infeasible"), ("verified", "verified_infeasible")):
         assert f'"{true}"' in lines
         lines = lines.replace(f'"{true}"', f'"{false}"')
     journal.write_text(lines)
-    capsys.readouterr()
-    assert main(["validate", str(forged)]) in (1, 2)
-    captured = capsys.readouterr()
-    assert "the certificate could not be computed again" in captured.out + captured.err
+    code, out, err = command("validate", forged)
+    assert code in (1, 2)
+    assert "the certificate could not be computed again" in out + err

@@ -90,7 +90,7 @@ def test_bodies_that_overlap_before_any_load_cause_a_remark(
         assert "a slave node lies 0.1 m inside its master" in case.remarks[0]
 
 
-def test_an_answer_has_the_remarks_on_the_input_too(tmp_path, capsys):
+def test_an_answer_has_the_remarks_on_the_input_too(tmp_path, command):
     """The blocks overlap, are softer than rubber and are compressed by 60 %."""
     toml = BLOCKS.replace("1e9", "1e4").replace("-1e6", "-6e3")
     case = f"bodies:{stacked_blocks(tmp_path, gap=-0.1, toml=toml)}/dual"
@@ -105,8 +105,8 @@ def test_an_answer_has_the_remarks_on_the_input_too(tmp_path, capsys):
     assert len(answer.remarks) == len(texts)
     for remark, text in zip(answer.remarks, texts, strict=True):
         assert text in remark
-    main(Registries(), ["solve", case, "--solver", "smalbe", "--json"])
-    assert json.loads(capsys.readouterr().out)["remarks"] == [*answer.remarks]
+    _, out, _ = command("solve", case, "--solver", "smalbe", "--json")
+    assert json.loads(out)["remarks"] == [*answer.remarks]
 
 
 @pytest.mark.parametrize(
