@@ -84,14 +84,6 @@ def test_violated_contact_rows_are_added():
     assert s.counts["factorisations"] == 2
 
 
-def test_a_fixed_variable_is_never_released():
-    s = solve(QP.from_arrays(np.eye(2), [-5.0, -1], lb=[2.0, -9], ub=[2.0, 9]))
-
-    assert s.x == pytest.approx([2, 1])
-    assert s.z_box == pytest.approx([3, 0], abs=1e-8)
-    assert "set_changes" not in s.counts
-
-
 def test_a_row_whose_only_free_variable_is_stiff_gets_a_larger_weight():
     """x₁ is at its bound. With the weight of the soft x₁, x₂ would not converge."""
     qp = QP.from_arrays(
@@ -157,53 +149,6 @@ def test_scaled_repeated_and_zero_rows_change_no_answer():
     assert mixed.status is Status.SOLVED
     assert mixed.x == pytest.approx(plain.x, abs=1e-6)
     assert rows.T @ mixed.y == pytest.approx(A.T @ plain.y, abs=1e-6)
-
-
-@pytest.mark.parametrize("store", [np.asarray, csr_array], ids=["dense", "sparse"])
-@pytest.mark.parametrize(
-    ("arrays", "x"),
-    [
-        (dict(P=np.eye(3), q=np.zeros(3), lb=0.0), [0, 0, 0]),
-        (dict(P=np.eye(3), q=np.ones(3), lb=0.0), [0, 0, 0]),
-        (dict(P=np.eye(3), q=-np.ones(3), lb=0.0), [1, 1, 1]),
-        (dict(P=np.eye(3), q=np.zeros(3), lb=[1.0, -1, -np.inf]), [1, 0, 0]),
-        (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, -9], ub=[2.0, 9]), [2, 1]),
-        (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, 3], ub=[2.0, 3]), [2, 3]),
-        # an iterate has more active bounds than the row permits
-        (dict(P=np.eye(2), q=[1.0, 1], A=[[1, 1]], b=[4.0], lb=0.0), [2, 2]),
-        # singular P: x₂ is at its bound, because its gradient is 1
-        (dict(P=[[1, 0], [0, 0]], q=[-1.0, 1], lb=[-np.inf, -3]), [1, -3]),
-        (dict(P=np.zeros((2, 2)), q=[1.0, 2], A=[[1, 1]], b=[1.0], lb=0.0), [1, 0]),
-    ],
-    ids=["q = 0", "all active", "none active", "shifted bound", "fixed", "all fixed",
-         "row", "singular", "linear"],
-)  # fmt: skip
-def test_degenerate_problems_have_their_solutions(arrays, x, store):
-    qp = QP.from_arrays(**arrays | {"P": store(arrays["P"])})
-    s = solve(qp)
-
-    assert s.status is Status.SOLVED
-    assert s.x == pytest.approx(x, abs=1e-7)
-    assert kkt_residuals(qp, s).worst <= 5e-9
-
-
-@pytest.mark.parametrize(
-    "qp",
-    [
-        QP.from_arrays(np.eye(3), np.ones(3), A=[[1, 1, 0], [2, 2, 0]], b=[1, 3]),
-        QP.from_arrays(np.eye(2), [1.0, 1], A=[[1, 1]], b=[5.0], lb=0.0, ub=1.0),
-        QP.from_arrays(np.eye(2), [0.0, 0], A=[[1, 1]], b=[-1.0], lb=0.0),
-        QP.from_arrays(np.eye(2), [0.0, 0], G=[[1, -1], [-1, 1]], h=[-1, -1]),
-        QP.from_arrays(np.eye(3), np.ones(3), A=[[1, 2, 3]], b=[7.0], lb=1.0, ub=1.0),
-    ],
-    ids=["rows", "box", "half space", "inequalities", "all fixed"],
-)
-def test_problems_without_a_feasible_point_are_reported(qp):
-    s = solve(qp)
-
-    assert s.status is Status.INFEASIBLE
-    assert "no point" in s.message
-    assert np.isnan(s.x).all()
 
 
 @pytest.mark.parametrize("store", [np.asarray, csr_array], ids=["dense", "sparse"])
