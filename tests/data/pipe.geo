@@ -1,0 +1,22 @@
+// Half of a pipe on a strip of elastic ground. Lengths in mm.
+r = 90; R = 100;
+Point(1) = {0, R, 0};
+Point(2) = {0, 0, 0};  Point(3) = {R, R, 0};  Point(4) = {0, 2*R, 0};
+Point(5) = {0, 2*R - 10, 0};  Point(6) = {r, R, 0};  Point(7) = {0, 10, 0};
+Circle(1) = {2, 1, 3};  Circle(2) = {3, 1, 4};  Line(3) = {4, 5};
+Circle(4) = {5, 1, 6};  Circle(5) = {6, 1, 7};  Line(6) = {7, 2};
+Curve Loop(1) = {1, 2, 3, 4, 5, 6};  Plane Surface(1) = {1};
+Point(11) = {0, -60, 0};  Point(12) = {150, -60, 0};
+Point(13) = {150, 0, 0};  Point(14) = {0, 0, 0};
+Line(11) = {11, 12};  Line(12) = {12, 13};  Line(13) = {13, 14};  Line(14) = {14, 11};
+Curve Loop(2) = {11, 12, 13, 14};  Plane Surface(2) = {2};
+Field[1] = Distance;  Field[1].PointsList = {2};
+Field[2] = Threshold;  Field[2].InField = 1;
+Field[2].SizeMin = 2;  Field[2].SizeMax = 20;
+Field[2].DistMin = 8;  Field[2].DistMax = 120;
+Background Field = 2;  Mesh.MeshSizeExtendFromBoundary = 0;
+Mesh.RecombineAll = 1;
+Physical Surface("pipe") = {1};  Physical Surface("ground") = {2};
+Physical Curve("bottom") = {1};  Physical Curve("inside") = {4, 5};
+Physical Curve("surface") = {13};  Physical Curve("base") = {11};
+Physical Curve("symmetry") = {3, 6, 14};
