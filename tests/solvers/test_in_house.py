@@ -9,6 +9,7 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Status
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
+from tests.support.small_qps import floating_dual
 
 SMALBES = [name for name in SOLVERS if name.startswith("smalbe")]
 NAMES = [*SMALBES, "pdas", "projected-gradient"]
@@ -93,3 +94,28 @@ def test_scaling_the_objective_changes_no_step(name, exponent):
 
     assert scaled.counts == plain.counts
     assert (scaled.x == plain.x).all()
+
+
+@pytest.mark.parametrize("seed", [271828, 314159, 161803])
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-10])
+@pytest.mark.parametrize("name", NAMES)
+def test_duals_of_floating_bodies_are_solved(name, seed, tol):
+    qp = floating_dual(seed)
+    s = solved(name, qp, tol)
+
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 10 * tol
+
+
+@pytest.mark.parametrize("name", ["smalbe", "pdas"])
+@pytest.mark.parametrize("seed", [271828, 314159])
+def test_scaled_repeated_and_zero_rows_change_no_answer(name, seed):
+    qp = floating_dual(seed)
+    A, b = qp.A, qp.b
+    rows = np.vstack([1e6 * A[0], A[1], 1e-6 * A[2], A.sum(axis=0), 0 * A[0]])
+    e = np.array([1e6 * b[0], b[1], 1e-6 * b[2], b.sum(), 0.0])
+    plain, mixed = (solved(name, one) for one in (qp, replace(qp, A=rows, b=e)))
+
+    assert mixed.status is Status.SOLVED
+    assert qp.objective(mixed.x) == pytest.approx(qp.objective(plain.x), rel=1e-8)
+    assert rows.T @ mixed.y == pytest.approx(A.T @ plain.y, abs=1e-7)

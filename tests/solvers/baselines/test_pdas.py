@@ -17,6 +17,7 @@ from mortarbench.solvers.common.infeasibility_certificate import (
     proves_unbounded,
 )
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.small_qps import floating_dual
 
 
 def solve(qp, tol=1e-9):
@@ -36,17 +37,6 @@ CYCLES = {
 @pytest.fixture(params=CYCLES.values(), ids=CYCLES)
 def cycling(request):
     return QP.from_arrays(*request.param, lb=0.0)
-
-
-def dual(seed, n=30, r=3):
-    """Draw the dual of a floating body: F of rank n − 2, λ ≥ 0 for half of the
-    components, Gλ = e.
-    """
-    rng = np.random.default_rng(seed)
-    W = rng.standard_normal((n, n - 2))
-    G, x = rng.standard_normal((r, n)), np.abs(rng.standard_normal(n))
-    lb = np.where(np.arange(n) < n // 2, -np.inf, 0.0)
-    return QP.from_arrays(W @ W.T / n, rng.standard_normal(n), A=G, b=G @ x, lb=lb)
 
 
 def test_the_two_sided_box_is_crossed_in_three_solves():
@@ -117,7 +107,7 @@ def test_the_step_limit_is_reported_with_the_point_reached(cycling):
 @pytest.mark.parametrize("seed", [271828, 314159])
 def test_scaling_objective_or_rows_changes_no_counter(seed, exponent):
     """The factors are powers of two, so that the arithmetic is exact."""
-    qp, factor = dual(seed), 2.0**exponent
+    qp, factor = floating_dual(seed), 2.0**exponent
     plain = solve(qp)
     for scaled in (
         replace(qp, P=qp.P * factor, q=qp.q * factor),
@@ -127,28 +117,6 @@ def test_scaling_objective_or_rows_changes_no_counter(seed, exponent):
         assert s.counts == plain.counts
         assert s.iterations == plain.iterations
         assert (s.x == plain.x).all()
-
-
-@pytest.mark.parametrize("seed", [271828, 314159, 161803])
-@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-10])
-def test_duals_of_floating_bodies_are_solved(seed, tol):
-    qp = dual(seed)
-    s = solve(qp, tol)
-
-    assert s.status is Status.SOLVED
-    assert kkt_residuals(qp, s).worst <= 5 * tol
-
-
-def test_scaled_repeated_and_zero_rows_change_no_answer():
-    qp = dual(271828)
-    A, b = qp.A, qp.b
-    rows = np.vstack([1e6 * A[0], A[1], 1e-6 * A[2], A.sum(axis=0), 0 * A[0]])
-    e = np.array([1e6 * b[0], b[1], 1e-6 * b[2], b.sum(), 0.0])
-    plain, mixed = solve(qp), solve(replace(qp, A=rows, b=e))
-
-    assert mixed.status is Status.SOLVED
-    assert mixed.x == pytest.approx(plain.x, abs=1e-6)
-    assert rows.T @ mixed.y == pytest.approx(A.T @ plain.y, abs=1e-6)
 
 
 @pytest.mark.parametrize("store", [np.asarray, csr_array], ids=["dense", "sparse"])
@@ -222,7 +190,7 @@ def test_a_direction_of_descent_must_be_free_of_curvature_and_constraints():
 
 
 def test_a_sequence_starts_from_the_last_active_set():
-    qp = dual(271828)
+    qp = floating_dual(271828)
     prepare = PDAS().chain(1e-9)
     cold, warm = prepare(qp)(), prepare(replace(qp, q=1.0001 * qp.q))()
 
@@ -234,11 +202,11 @@ def test_a_sequence_starts_from_the_last_active_set():
 def test_a_sequence_continues_after_a_problem_of_another_size():
     prepare = PDAS().chain(1e-9)
     for n in (30, 20, 30):
-        assert prepare(dual(271828, n))().status is Status.SOLVED
+        assert prepare(floating_dual(271828, n))().status is Status.SOLVED
 
 
 def test_an_operator_is_declined():
-    qp = dual(271828)
+    qp = floating_dual(271828)
     operator = replace(qp, P=aslinearoperator(qp.P))
     assert PDAS().declines(operator) == "needs explicit matrices"
 

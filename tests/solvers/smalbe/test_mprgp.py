@@ -96,12 +96,7 @@ def run_compiled(
     return run, F.count
 
 
-@pytest.fixture
-def minimise():
-    return minimised
-
-
-def minimised(
+def minimise(
     A,
     b,
     lower,
@@ -128,7 +123,7 @@ def minimised(
     )
 
 
-def test_without_active_bounds_it_is_conjugate_gradients(minimise):
+def test_without_active_bounds_it_is_conjugate_gradients():
     """The number of steps is the number of distinct eigenvalues."""
     run, products = minimise(
         np.diag(np.repeat([1.0, 3.0, 10.0, 40.0], 5)), np.arange(1.0, 21.0),
@@ -139,7 +134,7 @@ def test_without_active_bounds_it_is_conjugate_gradients(minimise):
 
 
 @pytest.mark.parametrize(("Gamma", "first"), [(1.9, "p"), (2.1, "c")])
-def test_proportioning_when_beta_exceeds_gamma_times_phi(minimise, Gamma, first):
+def test_proportioning_when_beta_exceeds_gamma_times_phi(Gamma, first):
     """‖β‖ = 2 and ‖φ̃‖ = ‖φ‖ = 1, so Γ = 2 is the threshold. The algorithm compares
     ‖β‖² with Γ²‖φ‖².
     """
@@ -149,14 +144,14 @@ def test_proportioning_when_beta_exceeds_gamma_times_phi(minimise, Gamma, first)
     assert run.trace[0] == first
 
 
-def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning(minimise):
+def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning():
     """φ = 1 but φ̃ = 10⁻⁹ in the first component: the reduced gradient decides."""
     run, _ = minimise(np.eye(2), [-1.0, 0.01], [-1e-9, 0.0], x=[0, 0], alpha=1.0)
 
     assert run.trace[0] == "p"
 
 
-def test_proportioning_stops_at_the_opposite_bound(minimise):
+def test_proportioning_stops_at_the_opposite_bound():
     """For min ½x² − 10x over [0, 1] from x = 0, the minimising step would end at 10."""
     run, _ = minimise([[1.0]], [10.0], [0.0], [1.0])
 
@@ -164,7 +159,7 @@ def test_proportioning_stops_at_the_opposite_bound(minimise):
     assert run.trace == "p"
 
 
-def test_an_expansion_projects_the_cg_step(minimise):
+def test_an_expansion_projects_the_cg_step():
     """From (1, 1) with H = I, b = (−1, 0), the CG step ends at (−1, 0), whose
     projection is (0, 0).
     """
@@ -175,7 +170,7 @@ def test_an_expansion_projects_the_cg_step(minimise):
     assert products == 2
 
 
-def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one(minimise):
+def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one():
     """In a tilted valley, the second CG step ends at (−1, 0); its projection onto x₁ =
     0 has a higher cost.
 
@@ -194,7 +189,7 @@ def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one(minimise):
     assert run.x == pytest.approx([0.0, 0.3])
 
 
-def test_a_fallback_is_a_half_step_and_a_gradient_projection(minimise):
+def test_a_fallback_is_a_half_step_and_a_gradient_projection():
     """By hand: the CG step is cut at x₁ = 0 and followed by −ᾱφ on the remaining free
     components.
     """
@@ -212,23 +207,21 @@ def test_a_fallback_is_a_half_step_and_a_gradient_projection(minimise):
     assert after.x == pytest.approx([0, half[1] - alpha * g[1]])
 
 
-def test_a_fixed_variable_neither_moves_nor_delays(minimise):
+def test_a_fixed_variable_neither_moves_nor_delays():
     run, _ = minimise(np.diag([1.0, 2.0]), [3.0, 4.0], [0.5, -np.inf], [0.5, np.inf])
 
     assert run.stopped
     assert run.x == pytest.approx([0.5, 2.0])
 
 
-def test_an_unbounded_cost_is_not_called_a_minimum(minimise):
+def test_an_unbounded_cost_is_not_called_a_minimum():
     run, _ = minimise([[0.0]], [1.0], [0.0], alpha=1.0)
 
     assert not run.stopped
 
 
 @pytest.mark.parametrize("rules", [Rules(), PROJECTED], ids=["model", "projected cg"])
-def test_every_iterate_is_feasible_and_the_cost_never_rises(
-    minimise, manufactured, rules
-):
+def test_every_iterate_is_feasible_and_the_cost_never_rises(manufactured, rules):
     qp, _ = manufactured("box", seed=271828, dense=True, n=24)
     costs = []
     for steps in range(30):
@@ -243,7 +236,7 @@ def test_every_iterate_is_feasible_and_the_cost_never_rises(
     assert np.diff(costs).max() <= 1e-13 * abs(costs[0])
 
 
-def test_a_step_of_a_model_below_the_operator_is_shortened(minimise):
+def test_a_step_of_a_model_below_the_operator_is_shortened():
     """H = 4I and B = I: the step of the model is four times too long, and the line
     search ends at x = b/4.
     """
@@ -255,7 +248,7 @@ def test_a_step_of_a_model_below_the_operator_is_shortened(minimise):
     assert run.x == pytest.approx([1.0, 10.0])
 
 
-def test_an_exact_model_finds_the_minimum_at_once(minimise):
+def test_an_exact_model_finds_the_minimum_at_once():
     """For B = H, the first step ends at the minimiser."""
     U = np.linalg.qr(np.random.default_rng(271828).standard_normal((20, 4)))[0].T
     B = Model(1.0, U, np.array([50.0, 20.0, 10.0, 5.0]))
@@ -266,7 +259,7 @@ def test_an_exact_model_finds_the_minimum_at_once(minimise):
     assert (run.trace, products) == ("p", 1)
 
 
-def test_a_preconditioner_in_the_face_is_used_with_conjugation(minimise):
+def test_a_preconditioner_in_the_face_is_used_with_conjugation():
     """M = A⁻¹ gives the solution in one step; with M = D⁻¹, the matrix D¹ᐟ²(I + rank
     2)D¹ᐟ² requires three steps.
     """
@@ -287,7 +280,7 @@ def test_a_preconditioner_in_the_face_is_used_with_conjugation(minimise):
     assert len(minimise(A, b, lower, tol=1e-8)[0].trace) > 10
 
 
-def test_the_observer_sees_every_step(minimise):
+def test_the_observer_sees_every_step():
     seen = []
     A, b, lower = string()
     run, _ = minimise(A, b, lower, watch=lambda *step: seen.append(step), tol=1e-6)
@@ -298,7 +291,7 @@ def test_the_observer_sees_every_step(minimise):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(minimise, seed):
+def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(seed):
     """For a flat spectrum in [1, 50] and B = I/20, about 27 products suffice; with
     constant τ, 40 are needed.
     """
@@ -314,7 +307,7 @@ def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(minimise, seed)
     assert products <= 32
 
 
-def test_an_expansion_by_the_model_begins_with_the_half_step(minimise):
+def test_an_expansion_by_the_model_begins_with_the_half_step():
     """By hand: the CG step is cut at x₁ = 0; the second part ends at the minimum of the
     model, or is extended to the minimum of the cost along the same line.
     """
@@ -332,7 +325,7 @@ def test_an_expansion_by_the_model_begins_with_the_half_step(minimise):
     assert after.x == pytest.approx(half + step * s)
 
 
-def test_a_half_step_that_is_the_solution_is_kept(minimise):
+def test_a_half_step_that_is_the_solution_is_kept():
     """For min ½x² + x over x ≥ −½ from 0, the CG step leads to −1, and the bound is the
     solution.
     """
@@ -343,7 +336,7 @@ def test_a_half_step_that_is_the_solution_is_kept(minimise):
     assert run.x == pytest.approx([-0.5])
 
 
-def model_run(minimise, problem, rules, B=None, tol=1e-6):
+def model_run(problem, rules, B=None, tol=1e-6):
     """Run MPRGP and record the letter, the active set and the cost of each step."""
     A, b, lower = problem
     upper, seen = np.full(b.size, np.inf), []
@@ -360,11 +353,11 @@ def model_run(minimise, problem, rules, B=None, tol=1e-6):
     return seen, products
 
 
-def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it(minimise):
+def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it():
     """Otherwise an expansion would undo the previous one, and conjugate gradients would
     never start.
     """
-    seen, products = model_run(minimise, string(), Rules())
+    seen, products = model_run(string(), Rules())
     expansions = 0
     for (_, before, _), (letter, after, _) in pairwise(seen):
         if letter == "e":
@@ -376,8 +369,8 @@ def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it(minimise)
     assert products <= 267  # number of products with PERMON's rules
 
 
-def test_every_model_step_decreases_the_cost(minimise):
-    steps, _ = model_run(minimise, string(), Rules())
+def test_every_model_step_decreases_the_cost():
+    steps, _ = model_run(string(), Rules())
     costs = [cost for _, _, cost in steps]
 
     assert (np.diff(costs) <= 1e-13 * abs(costs[-1])).all()
@@ -399,7 +392,7 @@ def string_and_boxes():
     return [(A, b, lower, np.full(b.size, np.inf)), *map(tight_box, range(60))]
 
 
-def test_there_are_at_most_as_many_steps_beyond_the_box_as_inside(minimise):
+def test_there_are_at_most_as_many_steps_beyond_the_box_as_inside():
     """One step beyond the box is allowed without steps inside; hence the products are
     at most doubled.
     """
@@ -426,7 +419,7 @@ def watched(seen, letter, at, free):
     seen.append(at)
 
 
-def test_each_step_achieves_the_decrease_of_the_convergence_theory(minimise):
+def test_each_step_achieves_the_decrease_of_the_convergence_theory():
     """Each step decreases f by at least G/4τ, with G = τ²(x − P(x − g/τ))ᵀg/τ, τ = ‖H‖
     and Γ = 1. Hence f − f* decreases by at least the factor 1 − λ_min/4‖H‖, which the
     book proves for steps of length 1/‖H‖.
@@ -467,7 +460,7 @@ def ill_conditioned(n):
     return (A + A.T) / 2, *rng.standard_normal((2, n))
 
 
-def test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns(minimise):
+def test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns():
     """If directions are conjugate to the last one only, rounding errors more than
     double the number of steps.
     """

@@ -21,6 +21,7 @@ from mortarbench.solvers.smalbe.projected import (
 )
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.small_qps import floating_dual
 
 INHOUSE = [name for name in SOLVERS if name.startswith("smalbe")]
 
@@ -72,46 +73,7 @@ def bounded(P, q, A=None, b=(), lb=-np.inf, ub=np.inf):
 
 @pytest.fixture
 def dual():
-    """Draw the dual of a floating body: F of rank n − 2, λ ≥ 0 on the second half, Gλ =
-    e.
-    """
-
-    def draw(seed, n=30, r=3):
-        rng = np.random.default_rng(seed)
-        W = rng.standard_normal((n, n - 2))
-        G, x = rng.standard_normal((r, n)), np.abs(rng.standard_normal(n))
-        lb = np.where(np.arange(n) < n // 2, -np.inf, 0.0)
-        return bounded(W @ W.T / n, rng.standard_normal(n), G, G @ x, lb=lb)
-
-    return draw
-
-
-@pytest.mark.parametrize("seed", [271828, 314159, 161803])
-@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-10])
-@pytest.mark.parametrize("name", INHOUSE)
-def test_claims_are_true(dual, name, seed, tol):
-    qp = dual(seed)
-    s = SOLVERS[name].prepare(qp, tol)()
-
-    assert s.status is Status.SOLVED
-    assert kkt_residuals(qp, s).worst <= 10 * tol
-
-
-@pytest.mark.parametrize("seed", [271828, 314159])
-def test_scaled_repeated_and_zero_rows_of_G_change_no_answer(dual, seed):
-    qp = dual(seed)
-    mix = np.vstack(
-        [1e6 * qp.A[0], qp.A[1], 1e-6 * qp.A[2], qp.A.sum(axis=0), 0 * qp.A[0]]
-    )
-    e = np.array([1e6 * qp.b[0], qp.b[1], 1e-6 * qp.b[2], qp.b.sum(), 0.0])
-    plain, mixed = (
-        SMALBE().prepare(qp, 1e-10)(),
-        SMALBE().prepare(replace(qp, A=mix, b=e), 1e-10)(),
-    )
-
-    assert mixed.status is Status.SOLVED
-    assert qp.objective(mixed.x) == pytest.approx(qp.objective(plain.x), rel=1e-8)
-    assert mix.T @ mixed.y == pytest.approx(qp.A.T @ plain.y, abs=1e-7)
+    return floating_dual
 
 
 def test_rows_that_contradict_each_other_by_rounding_end_the_solve():
