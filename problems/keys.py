@@ -132,12 +132,24 @@ def check_memory(components: int) -> None:
         least 1 KiB (stiffness matrix and its sparsity pattern), and about 4 KiB
         including the factor
     """
-    needed, limit = components * COMPONENT_MIB, case_limit_mib()
-    if needed > limit:
+    what = f"{components:.2g} displacement components take at least"
+    check_fits(what, components * COMPONENT_MIB, "a mesh")
+
+
+def check_fits(what: str, needed: float, smaller: str) -> None:
+    """Raise InputError if a case needs more memory than there is.
+
+    Parameters
+    ----------
+    what : beginning of the message, which the memory follows
+    needed : memory, MiB
+    smaller : what should fit into memory instead, for the message
+
+    """
+    if needed > (limit := case_limit_mib()):
         raise InputError(
-            f"{components:.2g} displacement components take at least {needed:.2g} MiB "
-            f"of memory; expected a mesh that fits into {limit:.0f} MiB, or "
-            f"{CASE_VARIABLE} set to the memory available"
+            f"{what} {needed:.2g} MiB of memory; expected {smaller} that fits into "
+            f"{limit:.0f} MiB, or {CASE_VARIABLE} set to the memory available"
         )
 
 

@@ -51,7 +51,6 @@ from mortarbench.harness import (
     Vector,
 )
 from mortarbench.harness.keys import DERIVED, Range
-from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.families.half_space.cases import (
     relative_distance,
@@ -64,7 +63,7 @@ from mortarbench.problems.families.hertz import (
     UNIT_LOAD,
 )
 from mortarbench.problems.families.line_contact import LineContact, TangentialContact
-from mortarbench.problems.keys import check_tangential
+from mortarbench.problems.keys import check_fits, check_tangential
 
 MU = 0.3
 LOAD = 10 * UNIT_LOAD  #: normal force P, N/m
@@ -95,13 +94,8 @@ class HalfPlane(Family):
         """Derive `peak`; check that the law admits Q and peak, and the size."""
         self.derive(peak=self.Q)
         super().__post_init__()
-        needed, limit = 8 * self.n**2 / 2**20, case_limit_mib()
-        if needed > limit:
-            raise InputError(
-                f"a full matrix of {self.n} rows takes {needed:.2g} MiB of memory; "
-                f"expected a matrix that fits into {limit:.0f} MiB, or {CASE_VARIABLE} "
-                "set to the memory available"
-            )
+        needed = 8 * self.n**2 / 2**20
+        check_fits(f"a full matrix of {self.n} rows takes", needed, "a matrix")
         if self.law == "cattaneo":
             check_tangential(self)
         elif key := next((key for key in ("Q", "peak") if getattr(self, key)), ""):

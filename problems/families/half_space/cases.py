@@ -44,7 +44,6 @@ from mortarbench.harness import (
     Vector,
 )
 from mortarbench.harness.keys import Range
-from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
 from mortarbench.harness.operators import assembled
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.families.half_space.influence import influence_operator
@@ -60,6 +59,7 @@ from mortarbench.problems.keys import (
     UNSET,
     Bound,
     Law,
+    check_fits,
     refuse_unused,
 )
 
@@ -116,13 +116,8 @@ class HalfSpace(Family):
                 "friction"
             )
         self._check_law()
-        needed, limit = _CELL_BYTES * self.n**2 / 2**20, case_limit_mib()
-        if needed > limit:
-            raise InputError(
-                f"a grid of {self.n} × {self.n} cells takes {needed:.2g} MiB of "
-                f"memory; expected a grid that fits into {limit:.0f} MiB, or "
-                f"{CASE_VARIABLE} set to the memory available"
-            )
+        needed = _CELL_BYTES * self.n**2 / 2**20
+        check_fits(f"a grid of {self.n} × {self.n} cells takes", needed, "a grid")
 
     def _check_law(self) -> None:
         """Raise InputError if law, friction and their parameters are incompatible."""
