@@ -12,7 +12,6 @@ from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 
 from mortarbench.harness import (
@@ -59,13 +58,13 @@ from mortarbench.problems.feti.elastic import (
 from mortarbench.problems.feti.mechanics import torn_mechanics
 from mortarbench.problems.feti.partition import graph_partition
 from mortarbench.problems.feti.served import Served
-from mortarbench.problems.feti.structured import blocks_of_meshes
 from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
     TornBodies,
 )
+from mortarbench.problems.feti.tearing import blocks, compact_blocks, joined_labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +145,15 @@ def subdivided(shape: Shape, size: int) -> Subdivision:
         which METIS cuts, the number of subdomains
     """
     mesh, body = shape.mesh, shape.body
-    if shape.grids:
-        return blocks_of_meshes(shape.grids, size, (mesh, body))
-    label = graph_partition(mesh.points, mesh.cells, body, size)
+    if not shape.grids:
+        label = graph_partition(mesh.points, mesh.cells, body, size)
+    elif mesh.dim == 3 or any(
+        part.grid.size > part.points.size for part in shape.grids
+    ):
+        # boxes of hexahedra, and half discs, whose central nodes coincide
+        label = joined_labels([compact_blocks(part.grid, size) for part in shape.grids])
+    else:
+        label = joined_labels([blocks(part.divisions, size) for part in shape.grids])
     return Subdivision(mesh, label, body)
 
 
@@ -259,7 +264,6 @@ def decompose(
     unit, pieces = bodies.length / bodies.force, bodies.piece
     D = elasticity_matrices(bodies.materials, bodies.plane) * unit
     E = np.array([m.E for m in bodies.materials]) * unit
-    share = longitudinal_share(D)
     n = contact.rows.shape[1]
     lift = None if bodies.lift is None else bodies.lift * stage.part
     return DecomposedProblem(
@@ -270,7 +274,6 @@ def decompose(
         E=E,
         names=bodies.names if pieces is None else joined_names(bodies.names, pieces),
         piece=pieces,
-        shaping=None if layout.shaping is None else layout.shaping(share),
         fixed=stage.fixed,
         # an array that several stages share takes memory only once
         load=stage.load if stage.part == 1 else stage.load * stage.part,
@@ -301,14 +304,6 @@ def _without_supports(contact: Contact, fixed: Nodes, u: Vector) -> Contact:
     rows = csr_array(contact.rows - off)
     rows.eliminate_zeros()
     return contact._replace(rows=rows, c=contact.c - off @ u)
-
-
-def longitudinal_share(D: NDArray[np.float64]) -> Vector:
-    """Return C₁₁ / (C₁₁ + C₆₆), (k,), for elasticity matrices (k, v, v) with entries C.
-
-    In Voigt's notation, C₆₆ is the last diagonal entry, the shear modulus.
-    """
-    return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, -1, -1]))
 
 
 def largest_stresses(torn: TornBodies, elastic: UnassembledBodies, u: Vector) -> Vector:

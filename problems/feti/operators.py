@@ -222,8 +222,8 @@ class DualOperator:
 
     def forget(self) -> None:
         """Discard all factors; the next product computes them again."""
-        for name in ("linear_map", "packed", "_blocks", "_diagonal", "_weighted"):
-            vars(self).pop(name, None)
+        for name in set(vars(self)) - set(self.__dataclass_fields__):
+            del vars(self)[name]
 
     def diagonal(self) -> Vector:
         """Return the diagonal of F, (m,)."""
@@ -243,9 +243,18 @@ class DualOperator:
             If `kind` or `scaling` is not one of these names.
 
         """
-        inverse, outer = gram_inverses(self.gram(kind, scaling), self.equalities)
-        self.weigh(kind, scaling, inverse)
-        return Composition(outer, self._weighted[kind, scaling], outer)
+        name = kind, scaling
+        if name not in self._preconditioners:
+            inverse, outer = gram_inverses(self.gram(kind, scaling), self.equalities)
+            self.weigh(kind, scaling, inverse)
+            self._preconditioners[name] = Composition(
+                outer, self._weighted[name], outer
+            )
+        return self._preconditioners[name]
+
+    @cached_property
+    def _preconditioners(self) -> dict[tuple[str, str], LinearMap]:
+        return {}
 
     def gram(self, kind: str, scaling: str) -> csr_array:
         """Return B W Bᵀ, (m, m)."""

@@ -96,6 +96,7 @@ class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no typ
         )
         ends = zip(torn.ends[:-1], torn.ends[1:], strict=True)
         rows = [LocalRows(csr_array(B[:, a:b]), *same) for a, b in ends]
+        self._preconditioners: dict[tuple[str, str], Product] = {}
         self._parts: Placed = torn.team.place(local_operator, rows, torn.parts)
 
     def build(self) -> OperatorOnRanks:
@@ -105,6 +106,7 @@ class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no typ
 
     def forget(self) -> None:
         """Discard all factors; the next product computes them again."""
+        self._preconditioners.clear()
         self._parts("forget")
 
     def diagonal(self) -> Vector:
@@ -113,11 +115,14 @@ class OperatorOnRanks(LinearOperator):  # type: ignore[misc]  # scipy has no typ
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
-        first, *others = self._parts("gram", kind, scaling)
-        inverse, outer = gram_inverses(sum(others, start=first), self._equalities)
-        self._parts("weigh", kind, scaling, inverse)
-        inner = partial(self._parts.total, "weighted", kind, scaling)
-        return lambda x: outer(inner(outer(x)))
+        name = kind, scaling
+        if name not in self._preconditioners:
+            first, *others = self._parts("gram", *name)
+            inverse, outer = gram_inverses(sum(others, start=first), self._equalities)
+            self._parts("weigh", *name, inverse)
+            inner = partial(self._parts.total, "weighted", *name)
+            self._preconditioners[name] = lambda x: outer(inner(outer(x)))
+        return self._preconditioners[name]
 
     def _matvec(self, x: Vector) -> Vector:
         return self._parts.total("__call__", x)

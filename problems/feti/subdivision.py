@@ -6,7 +6,7 @@ copy in each of them; copies are numbered in the order of their subdomains.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -15,16 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
-from mortarbench.harness import Vector
 from mortarbench.harness.digest import hex_digest
 from mortarbench.problems.fem.mesh import Mesh, Nodes
 
 Integers = NDArray[np.integer]
 Points = NDArray[np.float64]
-
-#: function that returns the factors (k,) of E at nodes (k,), for rows of supports
-#: (True) or of gluing (False)
-Shaping = Callable[[Nodes, bool], Vector]
 
 
 class TornNodes(NamedTuple):
@@ -43,9 +38,6 @@ class Subdivision:
     mesh: Mesh  #: mesh of all bodies, with N nodes
     label: NDArray[np.int64]  #: (E,) subdomain of each cell, 0 … S − 1
     body_of_cell: NDArray[np.int64]  #: (E,) body of each cell
-    #: function that maps the shares (bodies,) of `problems.feti.structured` to factors
-    #: for the shape of the cells; None if they are 1
-    shaping: Callable[[Vector], Shaping] | None = None
 
     @property
     def nodes(self) -> int:

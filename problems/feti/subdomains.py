@@ -18,8 +18,7 @@ This row is orthogonal to the gluing rows.
 Support and gluing rows are scaled by √E, with Young's modulus E of their body. Contact
 rows are normalised, then scaled by √E of the softest body they touch. If each body is
 homogeneous, the block of F = BK⁺Bᵀ for supports and gluing is therefore independent of
-E, and all other entries depend only on ratios of moduli. In support and gluing rows, E
-may be multiplied by a factor for the shape of the cells (`problems.feti.structured`).
+E, and all other entries depend only on ratios of moduli.
 """
 
 from __future__ import annotations
@@ -40,7 +39,6 @@ from mortarbench.harness.distributed.comm import Placed, Team
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.subdivision import (
     Integers,
-    Shaping,
     Subdivision,
     TornNodes,
 )
@@ -95,7 +93,6 @@ class DecomposedProblem:
     #: (bodies,) piece of each body; bodies of a piece have common nodes. None: every
     #: body is a piece
     piece: Integers | None = None
-    shaping: Shaping | None = None  #: factors of E; None if all are 1
     load: Vector  #: (n,) forces at global components
     fixed: Nodes  #: prescribed global components, in the order of their rows
     #: (n,) prescribed displacements, and zeros; None: all are zero
@@ -276,13 +273,11 @@ class TornBodies:
             shared[loaded] = np.einsum("mkq,mk->mq", rotation, shared[loaded])
         return np.asarray(load)
 
-    def row_stiffness(self, node: Nodes, *, supports: bool) -> Vector:
-        """Return the factors (k,) at torn nodes whose square roots scale rows of B.
+    def row_stiffness(self, node: Nodes) -> Vector:
+        """Return the moduli (k,) at torn nodes whose square roots scale rows of B.
 
         All copies of a node have the modulus of the softest of its bodies, because a
         gluing row is a difference of copies.
-
-        supports : True for rows of supports, False for rows of gluing
         """
         of, E_of, number = self.problem.layout, self.problem.E, self.nodes.number[node]
         E = E_of[of.body[self.nodes.subdomain[node]]]
@@ -291,8 +286,7 @@ class TornBodies:
             for copy in range(int(last.max(initial=-1)) + 1):
                 body = of.body[of.holder(number, np.minimum(copy, last))]
                 E = np.minimum(E, E_of[body])
-        shaping = self.problem.shaping
-        return E if shaping is None else E * shaping(number, supports)
+        return E
 
     @cached_property
     def rows(self) -> Rows:
@@ -391,7 +385,7 @@ def _support_rows(torn: TornBodies) -> Entries:
     node, k = np.divmod(problem.fixed, d)
     of, copy, at = _copies(torn, node)
     row = np.cumsum(problem.layout.multiplicity(node))[of] - 1 - copy
-    value = np.sqrt(torn.row_stiffness(at, supports=True))
+    value = np.sqrt(torn.row_stiffness(at))
     return _rotated(torn, row, at, k[of], value)
 
 
@@ -424,7 +418,7 @@ def _gluing_rows(torn: TornBodies) -> Entries:
         several = np.flatnonzero(nodes.multiplicity == m)
         number = nodes.number[several]
         before = of.before(number)
-        stiffness = np.sqrt(torn.row_stiffness(several, supports=False))
+        stiffness = np.sqrt(torn.row_stiffness(several))
         for k in range(d):
             component = d * number + k
             free = ~np.isin(component, fixed_m)

@@ -12,7 +12,6 @@ from mortarbench.problems.contact.bodies import Shape, UnassembledBodies
 from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.decomposed import (
     decompose,
-    longitudinal_share,
     subdivided,
 )
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
@@ -128,14 +127,6 @@ def test_a_face_fixed_along_some_axes_allows_the_other_motions(axes):
         assert_allclose(R.T @ R, np.eye(left), atol=1e-14)
         assert abs(R[fixed]).max() <= 1e-15
         assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
-
-
-def test_the_longitudinal_share_is_the_same_in_plane_strain_and_in_space():
-    strain = elasticity_matrix(STEEL, "strain")[None]
-    space = elasticity_matrix(STEEL, None)[None]
-
-    assert longitudinal_share(strain) == pytest.approx([2 * (1 - 0.3) / (3 - 4 * 0.3)])
-    assert (longitudinal_share(strain) == longitudinal_share(space)).all()
 
 
 def test_slip_on_an_ill_conditioned_dual_gives_the_same_displacement_in_few_products():

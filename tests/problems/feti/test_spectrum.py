@@ -137,19 +137,6 @@ def spectrum_of_beam_ring(layers: int, cells: int) -> Spectrum:
     return result
 
 
-#: ‖PFP‖/κ of plates of 2 × 2 subdomains, by cells per side of a subdomain
-OF_SQUARES = {4: 5.63810 / 9.9829, 8: 10.92276 / 19.4934}
-
-
-@pytest.mark.parametrize("cells", [4, 8])
-def test_stretched_cells_of_a_ring_leave_the_least_eigenvalue_of_squares(cells) -> None:
-    """Without the shape factor, the smallest eigenvalue would be 7 % and 12 %
-    smaller."""
-    assert spectrum_of_beam_ring(2 * cells, cells).smallest == pytest.approx(
-        OF_SQUARES[cells], rel=0.005
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("cells", [4, 8])
 def test_the_condition_number_is_almost_constant_from_16_900_unknowns_on(cells) -> None:
