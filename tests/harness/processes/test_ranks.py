@@ -47,7 +47,7 @@ def assert_equal_answers(alone, answer, ranks):
     assert max(products) <= 1.02 * min(products)
     u, v = (alone.case.family_case.recover(a.solution) for a in (alone, answer))
     assert abs(u - v).max() <= 10 * TOL * abs(u).max()
-    assert 0 < answer.energy_bound <= 1e-5
+    assert 0 < answer.energy_bound == pytest.approx(alone.energy_bound, rel=0.1)
     assert answer.record.objective == pytest.approx(alone.record.objective, rel=1e-9)
     assert answer.quantities.keys() == alone.quantities.keys()
     assert answer.quantities["energy"] == pytest.approx(alone.quantities["energy"])

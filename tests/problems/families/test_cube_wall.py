@@ -33,7 +33,6 @@ def solved(keys, solver):
         pytest.param("n=20/dual-bounds", "smalbe", marks=pytest.mark.slow),
         pytest.param("n=20/dual-bounds", "clarabel", marks=pytest.mark.slow),
         pytest.param("n=20/dual", "smalbe", marks=pytest.mark.slow),
-        pytest.param("n=20/primal", "clarabel", marks=pytest.mark.slow),
         pytest.param("n=20/feti=5/dual", "smalbe", marks=pytest.mark.slow),
     ],
 )  # fmt: skip
