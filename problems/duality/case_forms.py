@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -27,7 +28,7 @@ from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
 from mortarbench.problems.contact.rows import ContactRows
 from mortarbench.problems.duality.dualisation import (
-    TornForm,
+    Transformed,
     dual_bounds,
     dualise,
     primal_form,
@@ -51,14 +52,10 @@ def case_of(
 
     form : one of FORMS
     """
-    path, torn = monolithic_path(problem, reference), None
+    path = monolithic_path(problem, reference)
     chosen = path.problem(choice.step)
     whole, friction, _ = chosen
     primal, count = whole.primal, path.iterates(choice.step)
-    if choice.size:
-        from mortarbench.problems.duality.torn_form import torn_form
-
-        torn = torn_form(problem, path, choice, chosen)
     bodies = problem.bodies.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
@@ -66,16 +63,21 @@ def case_of(
         solution = ContactSolution(state, count)
         return {**quantities(*state), **problem.results(solution)}
 
-    case = contact_case(
+    build = partial(
+        contact_case,
         bodies,
         primal,
         whole.rows,
-        form,
-        torn=torn,
         quantities=results,
         friction=friction,
         settle=lambda s: least_motion(bodies.rigid, primal, s, friction),
     )
+    if choice.size:
+        from mortarbench.problems.duality.torn_form import torn_case
+
+        case = torn_case(problem, path, choice, chosen, build)
+    else:
+        case = build(form)
     return case if problem.exact is None else with_exact_tractions(case, problem.exact)
 
 
@@ -99,19 +101,20 @@ def contact_case(
     bodies: Bodies,
     primal: QP,
     rows: ContactRows,
-    form: str,
+    form: str | Transformed,
     *,
     settle: Callable[[Solution], Solution] = lambda s: s,
     floating: Callable[[Bodies], GeneralisedInverse] = lambda bodies: bodies.floating,
     quantities: Callable[[Solution], Mapping[str, Any]],
     friction: Friction = NO_FRICTION,
-    torn: TornForm | None = None,
+    subdomains: NDArray[np.int64] | None = None,
 ) -> Case:
-    """Return the case, in one of FORMS, of a contact problem with a given primal QP.
+    """Return the case of a contact problem with a given primal QP.
 
     Parameters
     ----------
     rows : contact rows of `primal`
+    form : one of FORMS, or the dual itself
     settle : function that selects one of the solutions with equal forces, for all
         results except certificates
     floating : function that returns K⁺ for the form `dual`, with the rigid motions as
@@ -120,16 +123,13 @@ def contact_case(
         problem; z of this solution lists the multipliers of the contact rows, then
         those of the friction rows
     friction : friction law with a prescribed bound; the objective includes its work
-    torn : dual of decomposed bodies; if present, `form` is ignored
+    subdomains : (E,) subdomain of each cell, for plots; None for undivided bodies
 
     """
     matrices: Mapping[str, Any] = {}
-    decomposition: Mapping[str, Any] = {}
-    seconds, by_subdomains, label, digest = None, None, None, ""
-    if torn is not None:
-        transformed, seconds, matrices, decomposition, by_subdomains, label, digest = (
-            torn
-        )
+    seconds = None
+    if isinstance(form, Transformed):
+        transformed = form
     elif form == "primal":
         transformed = primal_form(primal, friction)
     else:
@@ -155,16 +155,15 @@ def contact_case(
     return Case(
         qp=transformed.qp,
         recover=lambda s: recovered(s).x * bodies.length,
-        quantities=lambda s: {**quantities(recovered(s)), **decomposition},
+        quantities=lambda s: quantities(recovered(s)),
         fields=lambda s: fields(
             bodies,
             primal,
             recovered(s),
             rows,
             friction,
-            subdomains=label,
+            subdomains=subdomains,
         ),
-        digest=digest,
         scale=transformed.sign * energy,
         constant=transformed.constant * energy,
         matrices=matrices,
@@ -183,8 +182,6 @@ def contact_case(
                 bodies.pieces[bodies.body],
             ),
             friction=friction,
-            # subdomains are certified for supports with u = 0
-            subdomains=None if has_lift else by_subdomains,
         ),
     )
 

@@ -37,11 +37,7 @@ from mortarbench.problems.contact.friction import friction_of
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.contact.rows import MIN_FREE, ContactRows, without_fixed
 from mortarbench.problems.contact.stepping import LoadPath, Stage, State
-from mortarbench.problems.duality.feti_dual import (
-    TornDual,
-    decomposition_quantities,
-    digest_of,
-)
+from mortarbench.problems.duality.feti_dual import TornDual, with_decomposition
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
@@ -195,12 +191,10 @@ def case_on_ranks(
         return {
             **quantities(*state, energy, largest),
             **problem.results(ContactSolution(state, count)),
-            **decomposition_quantities(served, dual.qp),
         }
 
-    return Case(
+    case = Case(
         qp=dual.qp,
-        digest=digest_of(served, first, others),
         recover=lambda s: displacement(s) * elastic.length,
         quantities=results,
         certifiable=lambda s: (
@@ -209,6 +203,7 @@ def case_on_ranks(
             dual.multipliers(s)[acts],
         ),
     )
+    return with_decomposition(case, served, first, others)
 
 
 def interface_state(

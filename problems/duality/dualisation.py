@@ -12,18 +12,16 @@ in 3D.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from mortarbench.harness import QP, Friction, Solution, Structure, Vector, no_rows
 from mortarbench.harness.mechanics import (
     NO_FRICTION,
-    DecomposedMechanics,
     contact_rows,
     friction_discs,
     friction_multipliers,
@@ -44,18 +42,6 @@ class Transformed(NamedTuple):
     #: function that returns a primal point (n,), which may be valid at the interface
     #: only; for undivided bodies, it is cheaper than `recover`
     interface_displacement: Callable[[Solution], Vector]
-
-
-class TornForm(NamedTuple):
-    """The dual of decomposed bodies."""
-
-    transformed: Transformed
-    seconds: float  #: time to form the dual, s
-    matrices: Mapping[str, Any]  #: matrices by their names in the paper
-    quantities: Mapping[str, Any]  #: quantities that describe the decomposition
-    mechanics: Callable[[], DecomposedMechanics]  #: data for certificates
-    label: NDArray[np.int64]  #: (E,) subdomain of each cell
-    digest: str  #: digest of the QP
 
 
 def primal_form(primal: QP, friction: Friction = NO_FRICTION) -> Transformed:

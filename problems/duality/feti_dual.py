@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Friction, Solution, Vector
+from mortarbench.harness import QP, Case, Friction, Solution, Vector
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.sets.convex import ConvexSet
@@ -137,15 +137,23 @@ def digest_of(served: Served, torn: TornBodies, others: int = 0) -> str:
     return hex_digest((*names, *data, str(others).encode()), 16)
 
 
-def feti_matrices(served: Served, dual: QP) -> dict[str, Any]:
-    """Return F, d, B, c and R of the dual, keyed by their names in the paper.
+def with_decomposition(
+    case: Case, served: Served, first: TornBodies, others: int = 0
+) -> Case:
+    """Return the case of a dual in subdomains with its digest, matrices and sizes.
 
-    If several processes apply F together, it cannot be exported; return {}.
+    first, others : see `digest_of`
     """
-    if isinstance(dual.P, OperatorOnRanks):
-        return {}
-    B, c, _ = served.torn.rows
-    return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": served.torn.kernel()}
+    sizes = decomposition_quantities(served, case.qp)
+    (B, c, _), q, matrices = served.torn.rows, case.qp.q, dict[str, Any]()
+    if not isinstance(case.qp.P, OperatorOnRanks):  # which cannot be exported
+        matrices = {"F": case.qp.P, "d": -q, "B": B, "c": c, "R": served.torn.kernel()}
+    return replace(
+        case,
+        digest=digest_of(served, first, others),
+        quantities=lambda s: {**case.quantities(s), **sizes},
+        matrices=matrices,
+    )
 
 
 def decomposition_quantities(served: Served, dual: QP) -> dict[str, Any]:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from time import perf_counter
 
+from mortarbench.harness import Case
 from mortarbench.problems.contact.stepping import Iterate
 from mortarbench.problems.duality.decomposed import contact_of, decompose, subdivided
-from mortarbench.problems.duality.dualisation import TornForm
-from mortarbench.problems.duality.feti_dual import (
-    decomposition_quantities,
-    digest_of,
-    feti_dual,
-    feti_matrices,
-)
+from mortarbench.problems.duality.feti_dual import feti_dual, with_decomposition
 from mortarbench.problems.duality.monolithic import (
     MonolithicLinearisation,
     MonolithicPath,
@@ -23,13 +20,18 @@ from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdomains import TornBodies
 
 
-def torn_form(
+def torn_case(
     problem: ContactProblem,
     path: MonolithicPath,
     choice: Choice,
     chosen: Iterate[MonolithicLinearisation],
-) -> TornForm:
-    """Return the dual in subdomains of the problem `chosen` of a load path."""
+    case_of_dual: Callable[..., Case],
+) -> Case:
+    """Return the case of the dual in subdomains of the problem `chosen` of a load path.
+
+    case_of_dual : function that returns the case of a dual of the undivided bodies, see
+        `problems.duality.case_forms.contact_case`
+    """
     served = _torn(problem, choice, path.last_of(choice.step), chosen)
     primal = chosen.problem.primal
     start = perf_counter()
@@ -38,15 +40,14 @@ def torn_form(
     others, first = path.before(choice.step, chosen), served
     if others:
         first = _torn(problem, choice, 0, path.problems(0)[0])
-    return TornForm(
-        transformed=dual,
-        seconds=seconds,
-        matrices=feti_matrices(served, dual.qp),
-        quantities=decomposition_quantities(served, dual.qp),
-        mechanics=torn_mechanics(served, primal.P),
-        label=served.torn.problem.layout.label,
-        digest=digest_of(served, first.torn, others),
-    )
+    case = case_of_dual(dual, subdomains=served.torn.problem.layout.label)
+    case = with_decomposition(case, served, first.torn, others)
+    mechanics = case.mechanics
+    assert mechanics is not None
+    if not (primal.A.T @ primal.b).any():  # subdomains need supports with u = 0
+        bodies = torn_mechanics(served, primal.P)
+        mechanics = replace(mechanics, subdomains=bodies)
+    return replace(case, dualise_seconds=seconds, mechanics=mechanics)
 
 
 def _torn(

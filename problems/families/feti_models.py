@@ -44,12 +44,7 @@ from mortarbench.problems.duality.dualisation import (
     dualise,
     primal_form,
 )
-from mortarbench.problems.duality.feti_dual import (
-    decomposition_quantities,
-    digest_of,
-    feti_dual,
-    feti_matrices,
-)
+from mortarbench.problems.duality.feti_dual import feti_dual, with_decomposition
 from mortarbench.problems.fem.elasticity import (
     Material,
     Plane,
@@ -155,13 +150,7 @@ class DecomposedFamily(Family):
         """Return the case of the dual in subdomains."""
         new = feti_dual(served, self.qp)
         case = self.case(new, torn_mechanics(served, self.qp.P))
-        sizes = decomposition_quantities(served, new.qp)
-        return replace(
-            case,
-            digest=digest_of(served, served.torn),
-            quantities=lambda s: {**case.quantities(s), **sizes},
-            matrices=feti_matrices(served, new.qp),
-        )
+        return with_decomposition(case, served, served.torn)
 
     def divided(self, form: str) -> Divided | None:
         """Return the subdomains of a form, or None if it is not in subdomains."""
