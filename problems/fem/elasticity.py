@@ -280,14 +280,17 @@ def rigid_motions(points: Floats) -> Floats:
 def rigid_modes(points: Floats) -> Floats:
     """Return an orthonormal basis R (n, r) of ker K of one body, see paper, eq. (4).
 
-    In 2D, the rigid motions of `rigid_motions` are already orthogonal. In 3D,
-    the rotations are taken about the principal axes of inertia of the nodes, because
-    rotations about the coordinate axes need not be orthogonal.
+    In 2D, the rigid motions of `rigid_motions` are already orthogonal. In 3D, rotations
+    about the coordinate axes need not be.
     """
-    R = rigid_motions(points)
-    dim = points.shape[1]
-    if R.shape[1] > dim + 1:
-        rotations = R[:, dim:]
-        R[:, dim:] = rotations @ np.linalg.eigh(rotations.T @ rotations)[1]
-    R /= np.linalg.norm(R, axis=0)
-    return R
+    return gram_schmidt(rigid_motions(points))
+
+
+def gram_schmidt(vectors: Floats) -> Floats:
+    """Return the orthonormal basis of independent columns that Gram–Schmidt defines.
+
+    In contrast to a factor Q of LAPACK, its signs do not depend on rounding errors.
+    """
+    Q, R = np.linalg.qr(vectors)
+    basis: Floats = Q * np.sign(R.diagonal())
+    return basis

@@ -24,6 +24,7 @@ PARTS = 4
 #: best fit is below this multiple of the largest distance of a node of the last part.
 #: This ratio is at least 0.35 for blocks, and may be 0 for bars that are one cell wide
 MIN_DISTANCE = 0.25
+TIE = 1e-6  #: relative difference between lengths that count as equal
 
 
 def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
@@ -40,7 +41,8 @@ def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
     chosen = []
     for group in groups:
         offset = points[group] - points[group].mean(axis=0)
-        chosen.append(group[np.linalg.norm(offset, axis=1).argmin()])
+        distance = np.linalg.norm(offset, axis=1)
+        chosen.append(group[_without_ties(distance).argmin()])
     fixing = np.array(chosen, dtype=np.int64)
     if points.shape[1] > 2:
         offset = points - points[fixing].mean(axis=0)
@@ -100,6 +102,17 @@ def _central(graph: Matrix, group: Nodes) -> int:
 
 def _halves(points: NDArray[np.float64], group: Nodes) -> tuple[Nodes, Nodes]:
     offset = points[group] - points[group].mean(axis=0)
-    axis = np.linalg.svd(offset, full_matrices=False)[2][0]
-    order = group[np.argsort(offset @ axis, kind="stable")]
+    weights = np.linspace(1, 1 - TIE, offset.shape[1])  # of equal principal axes
+    axis = np.linalg.svd(offset * weights, full_matrices=False)[2][0]
+    axis *= np.copysign(1, axis @ np.exp(-np.arange(axis.size)))
+    order = group[_without_ties(offset @ axis).argsort()]
     return order[: len(order) // 2], order[len(order) // 2 :]
+
+
+def _without_ties(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values increased slightly, so that the first of equal ones is the least.
+
+    Rounding errors, which depend on the kernel of BLAS, would otherwise decide.
+    """
+    largest: float = np.abs(values).max(initial=0.0)
+    return values + np.linspace(0, TIE * largest, values.size)

@@ -35,7 +35,9 @@ from sksparse.cholmod import Factor, cholesky
 
 from mortarbench.harness import Matrix, Vector
 from mortarbench.problems.fem.dissection import index_arrays
+from mortarbench.problems.fem.elasticity import gram_schmidt
 from mortarbench.problems.fem.elimination import scatter_symmetric
+from mortarbench.problems.fem.fixing import TIE
 from mortarbench.problems.fem.kernels import congruence
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.fem.multifrontal import Multifrontal, multifrontal
@@ -204,8 +206,11 @@ def supported_inverse(
         return _inverse(csc_array(K), free, kernel, interface)
     kernel[fixed] = 0  # null_space returns zeros only up to rounding
     kernel = np.linalg.qr(kernel)[0]
-    # pivoting selects components on which the motions are well conditioned
-    pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
+    # pivoting selects components on which the motions are well conditioned; weights
+    # decide between equal ones, instead of rounding errors
+    weights = np.linspace(1, 1 - TIE, len(kernel))
+    pins = qr(kernel.T * weights, mode="r", pivoting=True)[1][: kernel.shape[1]]
+    kernel = gram_schmidt(kernel @ np.linalg.inv(kernel[pins]))  # a unique basis
     return _inverse(csc_array(K), np.setdiff1d(free, pins), kernel, interface)
 
 

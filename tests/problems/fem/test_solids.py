@@ -28,7 +28,7 @@ from mortarbench.problems.fem.elasticity import (
 )
 from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, TETRA, WEDGE
 from mortarbench.problems.fem.fixing import fixing_nodes
-from mortarbench.problems.fem.inverse import floating_inverse
+from mortarbench.problems.fem.inverse import floating_inverse, supported_inverse
 from mortarbench.problems.fem.mesh import (
     Mesh,
     boundary_facets,
@@ -284,6 +284,27 @@ def test_fixing_nodes_of_bars_exclude_every_rotation(across):
         fixed = dofs_of(fixing_nodes(mesh.points), 3)
         sizes = np.linalg.svd(rigid_modes(mesh.points)[fixed], compute_uv=False)
         assert sizes[-1] > 0.25 * sizes[0]
+
+
+def test_rounding_errors_choose_neither_nodes_nor_bases_of_symmetric_bodies():
+    """Nodes of a cube are tied; with its base on a plane, it can slide and turn."""
+    mesh = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (4, 4, 4))
+    rng = np.random.default_rng(3)
+    nodes, R = fixing_nodes(mesh.points), rigid_modes(mesh.points)
+    K = stiffness(mesh, D / STEEL.E)
+    base = 3 * np.flatnonzero(mesh.points[:, 2] == 0) + 2
+    free = np.setdiff1d(np.arange(mesh.dofs), base)
+    inverse = supported_inverse(K, free, R)
+    f = rng.standard_normal(mesh.dofs)
+    assert inverse.kernel.shape[1] == 3
+    for _ in range(10):
+        noise = 1e-14 * rng.standard_normal(mesh.points.shape)
+        turned = R @ np.linalg.qr(rng.standard_normal((6, 6)))[0]
+        other = supported_inverse(K, free, turned)
+        assert fixing_nodes(mesh.points + noise).tolist() == nodes.tolist()
+        np.testing.assert_allclose(rigid_modes(mesh.points + noise), R, atol=1e-12)
+        np.testing.assert_allclose(other.kernel, inverse.kernel, atol=1e-12)
+        np.testing.assert_allclose(other(f), inverse(f), rtol=1e-9, atol=1e-9)
 
 
 def test_stresses_of_mixed_cells_use_the_material_of_each():
