@@ -15,6 +15,7 @@ from qpbenchmark import Problem, TestSet
 from scipy.sparse import csc_matrix
 
 FOLDER = Path(__file__).parent
+PARTS = ("data", "indices", "indptr")  #: arrays of a sparse matrix
 
 
 class ContactQpbenchmark(TestSet):
@@ -58,14 +59,10 @@ def load(path: Path, name: str) -> Problem:
     """Read a problem; absent rows are None, as qpsolvers expects."""
     with np.load(path) as data:
         P, G, A = (
-            csc_matrix(
-                (data[f"{M}_data"], data[f"{M}_indices"], data[f"{M}_indptr"]),
-                shape=data[f"{M}_shape"],
-            )
+            csc_matrix(tuple(data[f"{M}_{k}"] for k in PARTS), shape=data[f"{M}_shape"])
             for M in "PGA"
         )
         q, h, b, lb, ub = (data[v] for v in ("q", "h", "b", "lb", "ub"))
-    return Problem(
-        P, q, G if h.size else None, h if h.size else None,
-        A if b.size else None, b if b.size else None, lb, ub, name,
-    )  # fmt: skip
+    rows = [v if h.size else None for v in (G, h)]
+    rows += [v if b.size else None for v in (A, b)]
+    return Problem(P, q, *rows, lb, ub, name)

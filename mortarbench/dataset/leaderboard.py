@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from mortarbench.dataset.items import OPTIMAL, Row, catalogue
 from mortarbench.harness import checked
-from mortarbench.progress import Callback
-from mortarbench.registries import Plugins, Registries
 from mortarbench.reporting import Report
 from mortarbench.results import run
 
@@ -18,7 +17,6 @@ KINDS = {
     "jumps": "jumps",
     "iterations": "Coulomb iterations",
     "newton": "Newton steps",
-    "step": "load steps",
 }
 GROWTH = "growing loads, bounds"
 #: Solvers that are measured unless others are requested.
@@ -28,16 +26,7 @@ FLEET = (
 )  # fmt: skip
 
 
-def leaderboard(
-    folder: str | Path,
-    *,
-    out: str | Path | None = None,
-    solvers: Sequence[str] = (),
-    repeats: int | None = None,
-    plugins: Plugins = (),
-    progress: bool | Callback | None = None,
-    registries: Registries | None = None,
-) -> Report:
+def leaderboard(folder: str | Path, **options: Any) -> Report:
     """Measure solvers on the core and the sequences of a set, and rank them by class.
 
     All solvers have the tolerance 1e-6, at which their answers are judged. The steps of
@@ -46,12 +35,8 @@ def leaderboard(
     Parameters
     ----------
     folder : folder of `build`
-    out : result folder; default: ``out/leaderboard``
-    solvers : solvers to measure; default: those that mortarbench comes with
-    repeats : number of repeats; default: 2
-    plugins : Python files with more solvers
-    progress : see `mortarbench.run`
-    registries : see `mortarbench.run`
+    options : arguments of `mortarbench.run`, such as solvers, plugins, repeats and out,
+        which is ``out/leaderboard`` by default
 
     Raises
     ------
@@ -61,16 +46,16 @@ def leaderboard(
     """
     path = checked.path("folder", folder).resolve()
     rows = [r for r in catalogue(path) if r["core"] == "yes" or r["sequence"]]
-    sequences: dict[str, list[str]] = {}
-    for row in rows:
-        if row["sequence"]:
-            sequences.setdefault(row["sequence"], []).append(str(path / row["path"]))
-    every = {"path": [str(path / row["path"]) for row in rows]}
-    problems: list[dict[str, Any]] = [{"family": "file", "params": every}]
-    problems += [
-        {"family": "file", "params": {"path": sorted(files)}, "sequence": "path"}
-        for files in sequences.values()
+    files = {row["name"]: str(path / row["path"]) for row in rows}
+    problems: list[dict[str, Any]] = [
+        {"family": "file", "params": {"path": [*files.values()]}}
     ]
+    for sequence, steps in groupby(rows, lambda row: row["sequence"]):
+        if sequence:
+            paths = [files[row["name"]] for row in steps]
+            problems.append(
+                {"family": "file", "params": {"path": paths}, "sequence": "path"}
+            )
     suite = {
         "name": "leaderboard",
         "tolerances": [1e-6],
@@ -79,34 +64,25 @@ def leaderboard(
         "solvers": FLEET,
         "problems": problems,
     }
-    measured = run(
-        suite,
-        out=out,
-        solvers=solvers,
-        repeats=repeats,
-        plugins=plugins,
-        progress=progress,
-        registries=registries,
-    )
+    measured = run(suite, **options)
     import pandas as pd
 
     from mortarbench.reports.leaderboard import write_leaderboard
 
     items = pd.DataFrame(
-        {"case": f"file:{path / row['path']}", "group": group}
+        {"case": f"file:{files[row['name']]}", "group": group}
         | {key: row[key] for key in ("name", "sequence")}
         | {"step": int(row["step"] or 0)}
         for row in rows
         for group in groups(row)
     )
-    files, said = write_leaderboard(measured.folder, items)
-    return Report(files=tuple(files), said=tuple(said))
+    written, said = write_leaderboard(measured.folder, items)
+    return Report(files=tuple(written), said=tuple(said))
 
 
 def groups(row: Row) -> Iterator[str]:
     """Yield the classes of a problem, or the kind of a sequence."""
-    parts = row["sequence"].split("-")
-    if parts != [""]:
+    if parts := row["sequence"].split("-")[1:]:
         yield next((kind for part, kind in KINDS.items() if part in parts), GROWTH)
     elif row["kind"] != OPTIMAL:
         yield "no solution"

@@ -26,7 +26,8 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import svdvals
-from scipy.sparse import csc_array, csr_array, eye_array
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
+from scipy.sparse.linalg import norm
 
 from mortarbench.dataset.standard import curvature_exponents
 from mortarbench.harness import QP
@@ -69,7 +70,7 @@ def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> tuple[float, fl
     error = roundings * (0.5 * (size @ (abs(P) @ size)) + np.abs(qp.q) @ size)
     delta = _distance(qp, x)
     gradient = np.linalg.norm(qp.P @ x + qp.q)
-    high = objective + error + delta * (gradient + delta * _norm(qp.P))
+    high = objective + error + delta * (gradient + delta * norm(csc_array(qp.P)))
 
     force = Px + qp.q + A.T @ y.astype(Real) + G.T @ z.astype(Real)
     sizes = abs(P) @ size + np.abs(qp.q) + abs(A).T @ np.abs(y) + abs(G).T @ z
@@ -92,18 +93,23 @@ def optimum_interval(qp: QP, x: Vector, y: Vector, z: Vector) -> tuple[float, fl
 
 def least_curvature(P: Any) -> float:
     """Return λ with P ≥ λD² on the variables with curvature; 0 if none is proven."""
-    e = curvature_exponents(P)
-    used = np.flatnonzero(np.isfinite(e))
-    inner = csc_array(P)[np.ix_(used, used)]
-    if not used.size or abs(inner).sum() < abs(P).sum() * (1 - 1e-12):
+    rest = csc_array(P)[np.isinf(curvature_exponents(P))]
+    M = of_unit_diagonal(P)
+    if not M.nnz or abs(rest).sum() > 1e-12 * abs(P).sum():
         return 0.0
-    D = np.exp2(-e[used])
-    M = inner.multiply(D).multiply(D[:, None]).tocsc()
     for mu in CURVATURES:
-        residual = _cholesky_residual(M - mu * eye_array(used.size, format="csc"))
+        residual = _cholesky_residual(M - mu * eye_array(M.shape[0]))
         if residual <= mu / 2:
             return mu - residual
     return 0.0
+
+
+def of_unit_diagonal(P: Any) -> csc_array:
+    """Return D⁻¹PD⁻¹ on the variables with curvature."""
+    e = curvature_exponents(P)
+    used = np.flatnonzero(np.isfinite(e))
+    D = diags_array(np.exp2(-e[used]))
+    return csc_array(D @ csc_array(P)[np.ix_(used, used)] @ D)
 
 
 def _cholesky_residual(M: Any) -> float:
@@ -114,17 +120,13 @@ def _cholesky_residual(M: Any) -> float:
     from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
     try:
-        if M.nnz > M.shape[0] ** 2 / 10:
-            M = M.toarray()
-            L, longest = np.linalg.cholesky(M), M.shape[0]
-        else:
-            factor = cholesky(M)
-            L, order = csc_array(factor.L()), factor.P()
-            M, longest = M[order][:, order], np.diff(csr_array(L).indptr).max()
-    except (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError):
+        factor = cholesky(M)
+        L, order = csc_array(factor.L()), factor.P()
+    except CholmodNotPositiveDefiniteError:
         return np.inf
-    rounding = (int(longest) + 2) * np.finfo(float).eps * _norm(abs(L) @ abs(L).T)
-    return _norm(M - L @ L.T) + rounding
+    terms = int(np.diff(csr_array(L).indptr).max()) + 2
+    rounding = terms * np.finfo(float).eps * norm(abs(L) @ abs(L).T)
+    return float(norm(M[order][:, order] - L @ L.T) + rounding)
 
 
 def _distance(qp: QP, x: Vector) -> float:
@@ -146,7 +148,9 @@ def _distance(qp: QP, x: Vector) -> float:
         rounding = eps * (abs(qp.A) @ np.abs(x) + np.abs(qp.b))
         delta = 1.001 * float(np.linalg.norm(residual + rounding)) / values[-1]
     slack = qp.h - qp.G.astype(Real) @ x.astype(Real)
-    needed = eps * (abs(qp.G) @ np.abs(x) + np.abs(qp.h)) + delta * _lengths(qp)
+    needed = eps * (abs(qp.G) @ np.abs(x) + np.abs(qp.h)) + delta * norm(
+        csr_array(qp.G), axis=1
+    )
     is_near = bool((slack >= needed).all())
     for one in qp.sets:
         for limit in one.limits(x):
@@ -169,17 +173,6 @@ def tightened(qp: QP) -> QP:
             for one in qp.sets if isinstance(one, Discs)]  # fmt: skip
     return replace(
         qp,
-        h=qp.h - MARGIN * _lengths(qp),
+        h=qp.h - MARGIN * norm(csr_array(qp.G), axis=1),
         sets=(Box(qp.lb + margin, qp.ub - margin), *sets),
     )
-
-
-def _lengths(qp: QP) -> Vector:
-    """Return the lengths (p,) of the rows of G; 1 for rows of zeros."""
-    lengths = np.sqrt(csr_array(qp.G).power(2).sum(axis=1))
-    return np.where(lengths > 0, lengths, 1.0)
-
-
-def _norm(M: Any) -> float:
-    """Return the Frobenius norm of a dense or sparse matrix."""
-    return float(np.linalg.norm(M if isinstance(M, np.ndarray) else M.data))

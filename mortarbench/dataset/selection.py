@@ -17,13 +17,16 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import eigsh
 
 from mortarbench.case import as_case
-from mortarbench.dataset.folder import store_problem
+from mortarbench.dataset.folder import write_problem
 from mortarbench.dataset.items import (
     BITS,
     HERE,
@@ -46,11 +49,11 @@ from mortarbench.dataset.items import (
 from mortarbench.dataset.optimum import (
     UnprovenError,
     least_curvature,
+    of_unit_diagonal,
     optimum_interval,
 )
 from mortarbench.dataset.standard import (
     Scales,
-    curvature_exponents,
     last_bits,
     scales_of,
 )
@@ -58,7 +61,7 @@ from mortarbench.harness import QP, InputError
 from mortarbench.harness.errors import say
 from mortarbench.harness.files.store import write_arrays
 from mortarbench.harness.suite.suite import load_suite
-from mortarbench.registries import Registries, one_thread
+from mortarbench.registries import Registries, one_thread, reference
 
 CANDIDATES = "candidates.toml"  #: suite of the single problems and most sequences
 #: Bodies that only contact holds. Reversed loads pull them away.
@@ -81,6 +84,7 @@ COULOMB_CASES = (
 CAP = 4  #: largest number of problems of a family in the core
 #: Kernels of OpenBLAS. The last needs a processor with AVX-512.
 KERNELS = ("Haswell", "Prescott", "Sandybridge", "SkylakeX")
+YES = {True: "yes", False: "no"}
 #: Eigenvalues of the scaled P below this fraction of the largest count as zero.
 ZERO = 1e-8
 #: Largest n for which all eigenvalues are computed, and their number for larger n.
@@ -92,15 +96,13 @@ ACTIVE = 1e-7
 
 def main() -> None:
     """Select the set, and write its catalogue and stored bits."""
-    if sys.argv[1:]:  # in another process
+    if sys.argv[1:]:  # in a process with a given kernel
         rows = json.load(sys.stdin)
-        return print(json.dumps({row["name"]: store_problem(row) for row in rows}))
-    rows = sorted(described(), key=lambda row: row["path"])
-    with one_thread():
-        bits = {row["name"]: last_bits(scaled_qp(row)) for row in rows}
-    write_arrays(HERE / BITS, bits)
-    digests = [digests_under(kernel, rows) for kernel in KERNELS]
+        return print(json.dumps(_digests(rows) if rows else _candidates()))
+    rows = _under(KERNELS[0], [])
+    digests = [_under(kernel, rows) for kernel in KERNELS]
     rows = [row for row in rows if len({d[row["name"]] for d in digests}) == 1]
+    rows = without_gaps(rows)
     choose_core(rows)
     for row in rows:
         row["digest"] = digests[0][row["name"]]
@@ -108,17 +110,50 @@ def main() -> None:
     return None
 
 
-def described() -> Iterator[Row]:
-    """Yield the lines of all items whose optimum is proven, without their digests."""
+def _under(kernel: str, rows: Sequence[Row]) -> Any:
+    """Return the digests of the files of items, built with a kernel of OpenBLAS.
+
+    A digest depends on the kernel if errors exceed what the stored bits correct.
+    Without rows, return those of the candidates, which do not depend on the machine.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "mortarbench.dataset.selection", "child"],
+        input=json.dumps(rows),
+        env=os.environ | {"OPENBLAS_CORETYPE": kernel},
+        stdout=subprocess.PIPE,
+        check=True,
+        text=True,
+    )
+    return json.loads(done.stdout)
+
+
+def _digests(rows: Sequence[Row]) -> dict[str, str]:
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "item.npz")
+        return {row["name"]: write_problem(row, path) for row in rows}
+
+
+def _candidates() -> list[Row]:
+    """Return the lines of all candidates with a proof, and write their bits."""
+    rows, bits = [], {}
     for row in _items():
         try:
             with one_thread():
-                complete = _described(row)
-        except (UnprovenError, InputError, ArithmeticError) as e:
+                rows.append(described(row))
+                bits[row["name"]] = last_bits(scaled_qp(row))
+        except (InputError, ArithmeticError) as e:
             say(f"{row['name']} is left out: {e}")
-        else:
-            say(row["name"])
-            yield complete
+    write_arrays(HERE / BITS, bits)
+    return sorted(rows, key=lambda row: row["path"])
+
+
+def without_gaps(rows: Sequence[Row]) -> list[Row]:
+    """Leave out sequences without a step before the last, or with less than three."""
+    steps: dict[str, set[int]] = {}
+    for row in rows:
+        steps.setdefault(row["sequence"], set()).add(int(row["step"] or 0))
+    whole = {k for k, v in steps.items() if len(v) > 2 and v == {*range(1, 1 + len(v))}}
+    return [row for row in rows if row["sequence"] in {"", *whole}]
 
 
 def _items() -> Iterator[Row]:
@@ -175,11 +210,19 @@ def _slug(parts: Iterable[str]) -> str:
 _SCALES: dict[str, Scales] = {}  #: scales of a sequence: those of its last step
 
 
-def _described(row: Row) -> Row:
+def described(row: Row) -> Row:
+    """Return the line of a candidate with all columns but its digest.
+
+    Raises
+    ------
+    InputError, ArithmeticError
+        If the case cannot be built, or its optimum is not proven.
+
+    """
     case = cached_case(row["case"]).family_case
     qp, value = original(row["case"], row["change"]), 0.0
     if row["kind"] == OPTIMAL:
-        value = qp.objective(Registries().reference(qp).x)
+        value = qp.objective(reference(qp).x)
     scales = scales_of(qp, value)
     if row["sequence"]:
         scales = _SCALES.setdefault(row["sequence"], scales)
@@ -193,49 +236,45 @@ def _described(row: Row) -> Row:
         row |= _optimum(final, proof)
     for objection in objections(row, final, proof):
         raise UnprovenError(objection)
-    factor = 2.0**-scales.objective * case.scale
-    constant = "" if row["change"] else repr(case.constant)
-    row |= {"energy_scale": repr(factor), "energy_constant": constant}
+    factor = 2.0 ** -scales[1] * case.scale
+    constant = "" if row["change"] else f"{case.constant:.12g}"
+    row |= {"energy_scale": f"{factor:.12g}", "energy_constant": constant}
     return row | _structure(final) | _activity(final, proof)
 
 
 def _optimum(qp: QP, proof: Certificate) -> Row:
     """Return the optimum, and a bound of its error.
 
-    The bound is at least ten times the error, because other certificates, computed with
-    another kernel of BLAS, prove the optimum to a different accuracy.
+    The bound is at least twice the error, because other certificates, computed with
+    another kernel of BLAS, prove the optimum to a slightly different accuracy.
     """
     low, high = optimum_interval(qp, proof["x"], proof["y"], proof["z"])
     optimum = float(f"{(low + high) / 2:.12g}")
     size = max(1.0, abs(optimum))
     error = 2 * max(high - optimum, optimum - low) + 1e-12 * size
-    bound = max(10 ** np.ceil(1 + np.log10(error / size)), 1e-9) * size
+    bound = max(10 ** np.ceil(np.log10(error / size)), 1e-9) * size
     return {"optimum": repr(optimum), "bound": repr(float(bound))}
 
 
 def _structure(qp: QP) -> Row:
     """Return sizes, and estimates of condition and rank of the scaled P."""
-    P, n = csc_array(qp.P), qp.q.size
-    e = curvature_exponents(P)
-    D = diags_array(np.where(np.isfinite(e), np.exp2(-e), 0.0))
-    M = csc_array(D @ P @ D)
-    if n <= MAX_DENSE:
+    n, sizes, M = qp.q.size, qp.sizes, of_unit_diagonal(qp.P)
+    if M.shape[0] <= MAX_DENSE:
         values = np.linalg.eigvalsh(M.toarray())
     else:
-        least = eigsh(M, LEAST, sigma=-1e-6, return_eigenvectors=False)
-        values = np.append(least, eigsh(M, 1, return_eigenvectors=False))
+        start = np.ones(M.shape[0])  # the default of eigsh is random
+        least = eigsh(M, LEAST, sigma=-1e-6, v0=start, return_eigenvectors=False)
+        values = np.append(least, eigsh(M, 1, v0=start, return_eigenvectors=False))
     positive = values[values > ZERO * values.max()]
-    rank = n - (values.size - positive.size)
-    sizes = qp.sizes
+    rank = M.shape[0] - (values.size - positive.size)
+    entries = csc_array(qp.P).nnz + csc_array(qp.A).nnz + csc_array(qp.G).nnz
     return {
-        "dense": _yes(isinstance(qp.P, np.ndarray)),
-        "strictly_convex": _yes(rank == n),
+        "dense": YES[isinstance(qp.P, np.ndarray)],
+        "strictly_convex": YES[rank == n],
         "discs": str(sizes.get("discs", 0)),
         "n": str(n),
-        "equalities": str(sizes["equalities"]),
-        "inequalities": str(sizes["inequalities"]),
-        "bounds": str(sizes["bounds"]),
-        "nnz": str(P.nnz + csc_array(qp.A).nnz + csc_array(qp.G).nnz),
+        **{name: str(sizes[name]) for name in ("equalities", "inequalities", "bounds")},
+        "nnz": str(entries),
         "condition": f"{positive.max() / positive.min():.1e}",
         "rank": str(rank),
     }
@@ -247,12 +286,9 @@ def _activity(qp: QP, proof: Certificate) -> Row:
         return {"active_share": "", "degeneracy": ""}
     x, z = proof["x"], proof["z"]
     force = np.abs(qp.P @ x + qp.q + qp.A.T @ proof["y"] + qp.G.T @ z)
-    slacks, multipliers = [qp.h - qp.G @ x], [z]
-    for one in qp.sets:
-        for limits in one.limits(x):
-            slacks.append(limits.slack)
-            multipliers.append(force[limits.variable])
-    slack, multiplier = np.concatenate(slacks), np.concatenate(multipliers)
+    limits = [limit for one in qp.sets for limit in one.limits(x)]
+    slack = np.concatenate([qp.h - qp.G @ x, *(limit.slack for limit in limits)])
+    multiplier = np.concatenate([z, *(force[limit.variable] for limit in limits)])
     active = slack <= ACTIVE * max(np.abs(x).max(), 1e-300)
     weak = active & (multiplier <= ACTIVE * max(multiplier.max(initial=0.0), 1e-300))
     return {
@@ -263,20 +299,14 @@ def _activity(qp: QP, proof: Certificate) -> Row:
 
 def features(row: Row) -> list[float]:
     """Return the features by which problems are compared."""
-    number = {k: float(row[k] or 0) for k in ("n", "nnz", "rank", "active_share")}
-    n, m = number["n"], float(row["equalities"]) + float(row["inequalities"])
-    return [
-        np.log10(n),
-        np.log10(1 + m),
-        np.log10(number["nnz"] / n),
-        np.log10(float(row["condition"])),
-        number["active_share"],
-        float(row["degeneracy"] or 0),
-        1 - number["rank"] / n,
-        float(row["discs"] != "0"),
-        float(row["dense"] == "yes"),
-        float(row["kind"] != OPTIMAL),
-    ]
+    n, m, p, nnz, condition, rank, active, weak = (
+        float(row[name] or 0)
+        for name in ("n", "equalities", "inequalities", "nnz", "condition", "rank",
+                     "active_share", "degeneracy")
+    )  # fmt: skip
+    sizes = np.log10([n, 1 + m + p, nnz / n, condition])
+    classes = row["discs"] != "0", row["dense"] == "yes", row["kind"] != OPTIMAL
+    return [*sizes, active, weak, 1 - rank / n, *map(float, classes)]
 
 
 def choose_core(rows: Sequence[Row]) -> None:
@@ -295,27 +325,6 @@ def choose_core(rows: Sequence[Row]) -> None:
             single[i]["core"] = "yes"
             distance = np.linalg.norm(points[members] - points[i], axis=1)
             far = np.minimum(far, distance) if number else distance
-
-
-def digests_under(kernel: str, rows: Sequence[Row]) -> dict[str, str]:
-    """Return the digests of the files of all items, built with a kernel of OpenBLAS.
-
-    A digest depends on the kernel if errors exceed what the stored bits correct, for
-    instance because a kernel of a matrix has another basis.
-    """
-    done = subprocess.run(
-        [sys.executable, "-m", "mortarbench.dataset.selection", "digests"],
-        input=json.dumps(rows),
-        env=os.environ | {"OPENBLAS_CORETYPE": kernel},
-        stdout=subprocess.PIPE,
-        check=True,
-        text=True,
-    )
-    return dict(json.loads(done.stdout))
-
-
-def _yes(flag: bool) -> str:
-    return "yes" if flag else "no"
 
 
 if __name__ == "__main__":

@@ -16,18 +16,18 @@ A QP of a family becomes one of the set in three steps:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, diags_array, eye_array, issparse, tril
 
 from mortarbench.harness import QP
-from mortarbench.harness.operators import assembled
 from mortarbench.harness.qp import Vector
 from mortarbench.harness.sets.arrays import further_sets, set_arrays
 
 BITS = 40  #: bits of the largest number of an array
+LEAST_SIZE = 2.0**-10  #: least size of data of order one that defines a unit
 SHIFT = 2.0**-30  #: multiple of the diagonal that is added to an indefinite P
 #: Largest numbers of this fraction between powers of two change the unit. The fraction
 #: is irrational, so that numbers such as 1, which may have rounding errors, are not at
@@ -35,15 +35,9 @@ SHIFT = 2.0**-30  #: multiple of the diagonal that is added to an indefinite P
 _THRESHOLD = np.e - 2
 _KEPT = 256  #: number of integers that the stored bits of an integer distinguish
 Integers = NDArray[np.int64]
-
-
-class Scales(NamedTuple):
-    """Exponents of the powers of two that scale a QP."""
-
-    variables: int  #: a of x = 2ᵃx̂
-    objective: int  #: c of f̂ = 2ᶜf
-    equalities: int  #: e of Â = 2ᵃ⁺ᵉA, b̂ = 2ᵉb
-    inequalities: int  #: g of Ĝ = 2ᵃ⁺ᵍG, ĥ = 2ᵍh
+#: Exponents of the powers of two that scale a QP: a of x = 2ᵃx̂, c of f̂ = 2ᶜf, e of
+#: Â = 2ᵃ⁺ᵉA and b̂ = 2ᵉb, g of Ĝ = 2ᵃ⁺ᵍG and ĥ = 2ᵍh
+Scales = tuple[int, ...]
 
 
 def scales_of(qp: QP, optimum: float) -> Scales:
@@ -52,26 +46,23 @@ def scales_of(qp: QP, optimum: float) -> Scales:
     optimum : optimal value of the objective; 0 if there is none
     """
     c = -int(_exponent(optimum)) if optimum else 0
-    diagonal = qp.diagonal()
-    assert diagonal is not None
-    largest = float(np.max(diagonal, initial=0.0)) or 1.0
+    largest = float(np.max(qp.P.diagonal(), initial=0.0)) or 1.0
     a = -round((int(_exponent(largest)) + c) / 2)
     rows = [float(abs(M).max()) if M.shape[0] else 1.0 for M in (qp.A, qp.G)]
     e, g = (-a - int(_exponent(row or 1.0)) for row in rows)
-    return Scales(a, c, e, g)
+    return a, c, e, g
 
 
 def scaled(qp: QP, scales: Scales) -> QP:
-    """Return the QP in x̂, with an explicit P; entries are multiplied exactly."""
+    """Return the QP in x̂, with sparse rows; entries are multiplied exactly."""
     a, c, e, g = (2.0**exponent for exponent in scales)
-    P = qp.P if qp.is_explicit else assembled(qp.P)
     T = a * eye_array(qp.q.size, format="csc")
     return QP(
-        P=P * (a * a * c),
+        P=qp.P * (a * a * c),
         q=qp.q * (a * c),
-        A=_without_noise(qp.A) * (a * e),
+        A=_without_noise(qp.A * (a * e)),
         b=qp.b * e,
-        G=_without_noise(qp.G) * (a * g),
+        G=_without_noise(qp.G * (a * g)),
         h=qp.h * g,
         sets=[one.substituted(T, np.zeros(qp.q.size)) for one in qp.sets],
     )
@@ -80,18 +71,16 @@ def scaled(qp: QP, scales: Scales) -> QP:
 def numbers(qp: QP) -> dict[str, tuple[Vector, Any]]:
     """Return the numbers of a QP with their units, keyed by the names of arrays.
 
-    P is represented by its lower triangle. A unit is a number or an array.
+    P, the last, is represented by its lower triangle. A unit is a number or an array.
     """
     P, e = _triangle(qp.P), np.maximum(curvature_exponents(qp.P), -BITS)
-    vectors = {"q": qp.q, "b": qp.b, "h": qp.h} | _sizes(set_arrays(qp.sets[1:]))
-    rows = {name: getattr(qp, name) for name in "AG"}
-    vectors |= {k: M.data if issparse(M) else M.ravel() for k, M in rows.items()}
-    bounds = np.concatenate([qp.lb, qp.ub])
-    unit = _unit(bounds)
+    vectors = {"q": qp.q, "b": qp.b, "h": qp.h, "A": qp.A.data, "G": qp.G.data}
+    vectors |= _sizes(set_arrays(qp.sets[1:]))
+    unit = _unit(np.concatenate([qp.lb, qp.ub]))
     return (
-        {"P": (P.data, np.exp2(e[P.row] + e[P.col] - BITS))}
-        | {name: (vector, _unit(vector)) for name, vector in vectors.items()}
+        {name: (vector, _unit(vector)) for name, vector in vectors.items()}
         | {"lb": (qp.lb, unit), "ub": (qp.ub, unit)}
+        | {"P": (P.data, np.exp2(e[P.row] + e[P.col] - BITS))}
     )
 
 
@@ -100,12 +89,12 @@ def rounded(qp: QP, bits: NDArray[np.uint8], *, is_shifted: bool) -> QP:
 
     bits : result of `last_bits`, or empty to use the integers that are nearest
     """
-    values, half, start = dict[str, Vector](), _KEPT // 2, 0
+    values, half, start = dict[str, Any](), _KEPT // 2, 0
     for name, (vector, unit) in numbers(qp).items():
         k = _integers(vector, unit)
-        if bits.size and _depends_on_blas(qp, name):
-            last = bits[start : start + k.size].astype(np.int64)
-            start += k.size
+        last = bits[start : start + k.size].astype(np.int64)
+        start += k.size
+        if last.size:
             k += (last - k + half) % _KEPT - half
         values[name] = np.where(np.isfinite(vector), k * unit, vector)
     P, e = _triangle(qp.P), curvature_exponents(qp.P)
@@ -113,30 +102,24 @@ def rounded(qp: QP, bits: NDArray[np.uint8], *, is_shifted: bool) -> QP:
     whole = csc_array(lower + tril(lower, -1).T)
     if is_shifted:
         whole = csc_array(whole + SHIFT * diags_array(np.exp2(2 * e) * (e > -np.inf)))
-    parts: dict[str, Any] = {k: values[k] for k in ("q", "b", "h", "lb", "ub")}
+    values["P"] = whole if issparse(qp.P) else whole.toarray()
     for name, M in (("A", qp.A), ("G", qp.G)):
-        if issparse(M):
-            parts[name] = csc_array((values[name], M.indices, M.indptr), shape=M.shape)
-        else:
-            parts[name] = values[name].reshape(M.shape)
-    parts["P"] = whole if issparse(qp.P) else whole.toarray()
+        values[name] = csc_array((values[name], M.indices, M.indptr), shape=M.shape)
     sets = further_sets(set_arrays(qp.sets[1:]) | _sizes(values))
-    return QP(**parts, sets=sets)
+    names = ("P", "q", "A", "b", "G", "h", "lb", "ub")
+    return QP(**{name: values[name] for name in names}, sets=sets)
 
 
 def last_bits(qp: QP) -> NDArray[np.uint8]:
-    """Return the last eight bits of the integers of arrays that depend on BLAS."""
-    parts = [
-        _integers(vector, unit) % _KEPT
-        for name, (vector, unit) in numbers(qp).items()
-        if _depends_on_blas(qp, name)
-    ]
+    """Return the last eight bits of the integers of arrays that depend on BLAS.
+
+    They are all but a stiffness matrix, which is assembled without BLAS.
+    """
+    pairs = numbers(qp)
+    if issparse(qp.P):
+        del pairs["P"]
+    parts = [_integers(vector, unit) % _KEPT for vector, unit in pairs.values()]
     return np.concatenate(parts).astype(np.uint8)
-
-
-def _depends_on_blas(qp: QP, name: str) -> bool:
-    """Return False for a stiffness matrix, which is assembled without BLAS."""
-    return name != "P" or not issparse(qp.P)
 
 
 def curvature_exponents(P: Any) -> Vector:
@@ -147,10 +130,9 @@ def curvature_exponents(P: Any) -> Vector:
     return e
 
 
-def _without_noise(M: Any) -> Any:
-    """Return rows without stored entries that would be rounded to zero."""
-    if not issparse(M) or not M.nnz:
-        return M
+def _without_noise(rows: Any) -> csc_array:
+    """Return sparse rows without entries that would be rounded to zero."""
+    M = csc_array(rows)
     kept = np.where(np.abs(M.data) > _unit(M.data), M.data, 0)
     M = csc_array((kept, M.indices.copy(), M.indptr.copy()), shape=M.shape)
     M.eliminate_zeros()
@@ -162,8 +144,9 @@ def _exponent(value: float) -> float:
 
 
 def _unit(vector: Vector) -> float:
-    largest = float(np.abs(vector[np.isfinite(vector)]).max(initial=0.0))
-    return float(2.0 ** (_exponent(largest or 1.0) - BITS))
+    """Return a unit, which is limited: vectors of rounding errors become zero."""
+    largest = float(np.abs(vector[np.isfinite(vector)]).max(initial=LEAST_SIZE))
+    return float(2.0 ** (_exponent(largest) - BITS))
 
 
 def _triangle(P: Any) -> coo_array:

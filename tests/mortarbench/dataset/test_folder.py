@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import mortarbench as mb
@@ -101,9 +102,7 @@ def test_a_flipped_bit_is_found(copy, capsys, name):
 )
 def test_a_missing_file_is_found(copy, capsys, name):
     (copy / name).unlink()
-    line = refuted(copy, capsys)
-    assert "missing" in line
-    assert name.removeprefix("certificates/") in line
+    assert name in refuted(copy, capsys)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +110,7 @@ def test_a_missing_file_is_found(copy, capsys, name):
     [
         ("torsion-n12-primal", {"optimum": lambda f: repr(float(f) + 3e-9)}, "refuted"),
         ("torsion-n12-primal", {"bound": lambda _: "1e-7"}, "expected at most 1e-08"),
-        ("membranes-n4-dual-reversed", {"kind": lambda _: "unbounded"}, "no vector x"),
+        ("membranes-n4-dual-reversed", {"kind": lambda _: "unbounded"}, "vector x"),
         ("torsion-n12-primal", {"kind": lambda _: "infeasible"}, "not prove"),
         ("torsion-n12-primal", {"kind": lambda _: "nice"}, "cannot be checked"),
         ("torsion-n12-primal", {"optimum": lambda _: "low"}, "cannot be checked"),
@@ -169,11 +168,19 @@ def test_an_interrupted_build_continues_and_leaves_finished_items(copy, monkeypa
 
 REBUILD = """
 import sys
-from mortarbench.dataset.folder import store_problem
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from mortarbench.dataset.folder import write_problem
 from mortarbench.dataset.items import catalogue
+from mortarbench.dataset.selection import described
 rows = {row["name"]: row for row in catalogue()}
 for name in sys.argv[1:]:
-    assert store_problem(rows[name]) == rows[name]["digest"], name
+    if not rows[name]["sequence"]:  # whose scales are those of the last step
+        assert described(dict(rows[name])) == rows[name], name
+with TemporaryDirectory() as folder:
+    for name in sys.argv[1:]:
+        path = Path(folder, "item.npz")
+        assert write_problem(rows[name], path) == rows[name]["digest"], name
 """
 
 
@@ -299,6 +306,7 @@ def test_an_own_solver_gets_its_place(copy, tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out
     report = tmp_path / "out/leaderboard/report"
     text = (report / "leaderboard.md").read_text()
+    records = pd.read_parquet(report / "records.parquet")
 
     assert "dense, tol 1e-6" in said
     for name in ("pdas", "daqp", "mine"):
@@ -306,4 +314,6 @@ def test_an_own_solver_gets_its_place(copy, tmp_path, monkeypatch, capsys):
     for group in ("dense", "sparse", "discs", "no solution", "sequences"):
         assert f"\n| {group}<br>" in text
     assert "Warm starts cost time" in text
-    assert (report / "records.parquet").is_file()
+    assert len(records) == len(mb.load("out/leaderboard").df)
+    assert set(records.solver) == {"pdas", "daqp", "mine"}
+    assert (records.total_seconds[records.status == "verified"] > 0).all()

@@ -9,7 +9,6 @@ from mortarbench.dataset.items import NO_BITS
 from mortarbench.dataset.selection import CAP, choose_core
 from mortarbench.dataset.standard import (
     SHIFT,
-    Scales,
     last_bits,
     numbers,
     rounded,
@@ -38,7 +37,7 @@ def random_qp(seed, *, dense):
 
 @pytest.mark.parametrize("dense", [True, False])
 def test_scaling_by_powers_of_two_is_exact(dense):
-    qp, scales = random_qp(1, dense=dense), Scales(-3, 5, 2, -1)
+    qp, scales = random_qp(1, dense=dense), (-3, 5, 2, -1)
     new, x = scaled(qp, scales), np.linspace(-1, 1, 9)
     assert new.objective(x * 8) == 2.0**5 * qp.objective(x)
     assert np.array_equal(new.h - new.G @ (8 * x), (qp.h - qp.G @ x) / 2)
