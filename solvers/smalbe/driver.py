@@ -35,6 +35,7 @@ from mortarbench.solvers.smalbe.projected import (
     unchanged,
 )
 from mortarbench.solvers.smalbe.rows import Rows
+from mortarbench.solvers.smalbe.spectrum import random_start
 
 STEPS = {
     "c": "cg",
@@ -86,7 +87,8 @@ class Residuals(NamedTuple):
     energy: float = 0.0  #: scale of energies; 0 if unknown
 
 
-Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
+#: function that returns the solution, and data for the next QP if it is solved
+Solve = Callable[[], tuple[Solution, Carry | None]]
 #: observer called after each step with its letter, x and g
 Note = Callable[[str, Vector, Vector], None]
 
@@ -130,7 +132,7 @@ def prepared(
     if not problem.rows.consistent:
         message = "the equality rows contradict each other"
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
-        return lambda: (nowhere, _nothing)
+        return lambda: (nowhere, None)
     loop = outer_loop(problem, qp, options, history)
     task = _Task(qp, problem, options, rho, loop, history, carry)
     return lambda: _solve_to_tolerance(task, tol)
@@ -138,7 +140,7 @@ def prepared(
 
 def _solve_without_free(
     qp: QP, tol: float, options: Options, small: Eliminated, inner: Solve
-) -> tuple[Solution, Callable[[], Carry | None]]:
+) -> tuple[Solution, Carry | None]:
     """Solve the QP without its free variables, and recover their values.
 
     If the recovered point does not solve `qp`, the whole QP is solved. This happens if
@@ -207,12 +209,9 @@ def _estimated_spectrum(
     correct a wrong model.
     """
     if carry is not None and options.expansion == "model":
-        previous, now = carry.spectrum.ritz, by_lanczos(F, C, steps=1).ritz
-        if (
-            previous
-            and now
-            and 0.5 * previous.at_start < now.at_start < 2 * previous.at_start
-        ):
+        previous = carry.spectrum.ritz
+        quotient = compiled.lanczos(F, C, random_start(C.n), 1)[3]
+        if previous and 0.5 * previous.at_start < quotient < 2 * previous.at_start:
             return carry.spectrum
     return by_lanczos(F, C, steps=steps)
 
@@ -316,16 +315,12 @@ def outer_loop(
         rule = options.step_rule_for(qp)
         solver = compiled.SMALBE(problem, options, kind != "none", M, rule)
     watch = (
-        None
-        if history is None
-        else partial(history.watch, problem, solver.face_and_gradients)
+        partial(history.watch, problem, solver.face_and_gradients) if history else None
     )
     return OuterLoop(solver, problem, options, watch)
 
 
-def _solve_to_tolerance(
-    task: _Task, tol: float
-) -> tuple[Solution, Callable[[], Carry | None]]:
+def _solve_to_tolerance(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
     """Tighten the outer loop until the KKT residual of the original QP is ≤ tol."""
     options, at = task.options, _start(task, tol)
     tighter, aim, best, waited = 1.0, 0.0, np.inf, 0
@@ -333,15 +328,16 @@ def _solve_to_tolerance(
         at = task.loop.solve(tighter * tol, at, aim)
         if at.status is Status.INFEASIBLE:
             message = "no point within the bounds satisfies the equality rows"
-            return Solution.without_point(task.qp, at.status, message), _nothing
+            return Solution.without_point(task.qp, at.status, message), None
         if at.status is Status.FAILED:
             message = "the iterates diverged"
-            return Solution.without_point(task.qp, at.status, message), _nothing
+            return Solution.without_point(task.qp, at.status, message), None
         point, Fx = _point(task, at)
         residuals = _residuals(task, point, Fx, tol)
         worst = max(residuals.gradient, residuals.rows)
         if worst <= tol:
-            return point, partial(_carry, task, point)
+            qp, problem = task.qp, task.problem
+            return point, Carry(qp.A, qp.b, problem.rows, problem.spectrum, point)
         waited = 0 if worst < 0.9 * best else waited + 1
         best = min(best, worst)
         if at.status is not Status.SOLVED or waited == MAX_IDLE_TIGHTENINGS:
@@ -357,7 +353,7 @@ def _solve_to_tolerance(
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
     point = replace(point, status=Status.ITERATION_LIMIT, message=message)
-    return point, _nothing
+    return point, None
 
 
 def _tightened(
@@ -375,19 +371,11 @@ def _tightened(
     estimate = task.loop.solver.estimate(at, force, energy)
     if stuck or gradient > 2 * estimate:
         x = task.problem.rows.x_tilde + at.nu
-        at = at._replace(g=task.loop.first(x, at.mu, M=at.M, rho=at.rho).g)
+        fresh = task.loop.first(x, at.mu, M=at.M, rho=at.rho)
+        at = at._replace(nu=fresh.nu, g=fresh.g)
         estimate = task.loop.solver.estimate(at, force, energy)
     aim = min(estimate, tol * estimate / max(gradient, TINY))
     return at, TINY if stuck else max(0.95 * aim, TINY)
-
-
-def _nothing() -> None:
-    """Return None instead of a `Carry` after a failed run."""
-
-
-def _carry(task: _Task, point: Solution) -> Carry:
-    qp, problem = task.qp, task.problem
-    return Carry(qp.A, qp.b, problem.rows, problem.spectrum, point)
 
 
 def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:

@@ -83,8 +83,7 @@ class SMALBE(Options):
 
             def run() -> Solution:
                 nonlocal carry
-                solution, left = solve()
-                carry = left()
+                solution, carry = solve()
                 return solution
 
             return run
