@@ -507,11 +507,6 @@ def _with_options(spec: SolverSpec, solver: Any, reserved: str = "") -> Solver:
     return configured
 
 
-def is_solver(thing: object) -> bool:
-    """Return True if `thing`, an object or a class, has the methods of a solver."""
-    return all(hasattr(thing, part) for part in _SOLVER_PARTS)
-
-
 def check_solver(thing: object) -> None:
     """Check that `thing` is a solver, and not the class of a solver.
 
@@ -521,12 +516,13 @@ def check_solver(thing: object) -> None:
         If `thing` is something else.
 
     """
-    if isinstance(thing, type) and is_solver(thing):
+    is_solver = all(hasattr(thing, part) for part in _SOLVER_PARTS)
+    if isinstance(thing, type) and is_solver:
         raise InputError(
             f"{thing.__name__} is a class; expected an instance, such as "
             f"{thing.__name__}()"
         )
-    if not is_solver(thing):
+    if not is_solver:
         raise InputError(
             f"{shown(thing)} is of type {_type(thing)}; expected a solver, an object "
             f"with the methods {' and '.join(_SOLVER_PARTS)}"

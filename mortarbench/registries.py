@@ -242,7 +242,10 @@ class Registries:
         captures its own environment. Otherwise, for example in a notebook with other
         libraries, a new process captures the environment.
         """
-        from mortarbench.harness.environment.environment import capture, capture_in
+        from mortarbench.harness.environment.environment import (
+            capture,
+            capture_in_worker,
+        )
         from mortarbench.solvers.common.libraries import PACKAGES
 
         if ONE_THREAD.items() <= os.environ.items():
@@ -250,7 +253,7 @@ class Registries:
             if all(pool["threads"] == 1 for pool in here["threads"]["pools"]):
                 return here
             # if not, the limits were set after the libraries had been loaded
-        return capture_in(ONE_THREAD, self.files, PACKAGES)
+        return capture_in_worker(self.files, PACKAGES)
 
     def _absolute_files(self, label: str = "") -> list[str]:
         """Return the plug-in files, those with a label first.

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.registry import PluginFile
 
 #: Packages whose versions may affect the measurements of all solvers.
@@ -51,7 +52,7 @@ def capture(
     """Describe the environment of this process as nested plain data.
 
     Values that cannot be read are None. The entries on threads describe the calling
-    process; `capture_in` describes the threads of a worker.
+    process; `capture_in_worker` describes the threads of a worker.
 
     plugins : plug-in files; digests of their code are included
     packages : packages of solvers whose versions are included
@@ -111,12 +112,10 @@ def capture(
     }
 
 
-def capture_in(
-    variables: Mapping[str, str],
-    plugins: Iterable[str | Path | PluginFile] = (),
-    packages: Iterable[str] = (),
+def capture_in_worker(
+    plugins: Iterable[str | Path | PluginFile] = (), packages: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Describe the environment of a new process with the given environment variables.
+    """Describe the environment of a new process with one thread in every library.
 
     A new process is needed, since libraries read their thread variables only when they
     are loaded.
@@ -129,7 +128,7 @@ def capture_in(
     arguments = ([*map(str, plugins)], [*packages])
     process = subprocess.run(
         [sys.executable, "-P", "-c", program, *map(json.dumps, arguments)],
-        env=os.environ | variables,
+        env=os.environ | ONE_THREAD,
         capture_output=True,
         text=True,
         check=True,

@@ -119,14 +119,14 @@ def save_qp(
     array([-1., -1.])
 
     """
-    arrays, dense, maker = _parts(qp, serialised=serialised)
+    arrays, entries = _parts(qp, serialised=serialised)
     digest = digest_of(arrays)
-    arrays["meta"] = np.array(json.dumps({**meta, **maker, "dense": dense}))
+    arrays["meta"] = np.array(json.dumps({**meta, **entries}))
     if serialised:
         write_mapped(path, arrays)
         return digest
     with writing(path) as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        np.savez(file, **arrays)
     return digest
 
 
@@ -135,35 +135,28 @@ def qp_digest(qp: QP, *, serialised: bool = False) -> str:
     return digest_of(_parts(qp, serialised=serialised)[0])
 
 
-def _parts(
-    qp: QP, *, serialised: bool
-) -> tuple[dict[str, NDArray[Any]], list[str], dict[str, str]]:
+def _parts(qp: QP, *, serialised: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the arrays to store for a QP, and the entries of its meta data.
 
-    The entries are the names of the dense matrices and, if P is serialised, the name of
-    its maker.
+    The entries are the names of the dense matrices (``dense``) and, if P is serialised,
+    the name of its maker.
     """
-    P = qp.P
-    if not (serialised and isinstance(P, SerialisableOperator)):
-        return *_arrays(qp, structure=serialised), {}
-    arrays, dense = _arrays(replace(qp, P=csc_array(P.shape)), structure=True)
-    arrays |= {_INGREDIENT + name: array for name, array in P.arrays.items()}
-    return arrays, dense, {"maker": P.maker}
-
-
-def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Return the arrays to store for a QP, and the names of its dense matrices."""
-    matrices, dense = explicit_matrices(qp)
-    arrays = {name: getattr(qp, name) for name in VECTORS}
+    arrays: dict[str, Any] = {name: getattr(qp, name) for name in VECTORS}
     arrays |= set_arrays(qp.sets[1:])
-    if structure and qp.structure is not None:
+    entries: dict[str, Any] = {}
+    if serialised and isinstance(P := qp.P, SerialisableOperator):
+        arrays |= {_INGREDIENT + name: array for name, array in P.arrays.items()}
+        entries["maker"] = P.maker
+        qp = replace(qp, P=csc_array(P.shape))
+    matrices, entries["dense"] = explicit_matrices(qp)
+    if serialised and qp.structure is not None:
         matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
         arrays["fixed"] = qp.structure.fixed
     for name, M in matrices.items():
         M = csc_array(M)
         parts = (M.data, M.indices, M.indptr, np.array(M.shape))
         arrays |= {f"{name}_{k}": a for k, a in zip(_PARTS, parts, strict=True)}
-    return arrays, dense
+    return arrays, entries
 
 
 def load_qp(

@@ -15,9 +15,8 @@ from typing import Any
 from distributed import get_worker
 
 from mortarbench.harness.environment.cpus import fastest_first
-from mortarbench.harness.environment.environment import capture_in, digest
+from mortarbench.harness.environment.environment import capture_in_worker, digest
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.operators import Maker
 from mortarbench.harness.processes.locks import file_lock
 from mortarbench.harness.registry import PluginFile, load_plugin, merged
@@ -92,7 +91,7 @@ def _environment(
     run: str, plugins: tuple[PluginFile, ...], packages: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return the environment of this node, captured once for each run."""
-    return capture_in(ONE_THREAD, plugins, packages)
+    return capture_in_worker(plugins, packages)
 
 
 @cache
