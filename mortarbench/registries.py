@@ -162,10 +162,8 @@ class Registries:
         extended = self
         for file in _plugin_files(files):
             plugin = load_plugin(file)
-            try:
+            with checked.located(f"{file.path}"):
                 extended = extended.extended(plugin)
-            except InputError as e:
-                raise InputError(f"{file.path}: {e}") from None
             extended = replace(extended, files=(*extended.files, file))
         return extended
 

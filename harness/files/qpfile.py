@@ -39,6 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, issparse
 
+from mortarbench.harness.checked import located
 from mortarbench.harness.errors import InputError, shortened, unknown
 from mortarbench.harness.files.datafile import json_object
 from mortarbench.harness.files.durable import writing
@@ -191,12 +192,11 @@ def load_qp(
 @contextmanager
 def malformed(path: Path) -> Iterator[None]:
     """Convert errors of arrays that define no QP to an InputError that names a file."""
-    try:
-        yield
-    except (ValueError, TypeError, OverflowError, KeyError) as e:
-        raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
-    except InputError as e:
-        raise InputError(f"{path}: {e}") from None
+    with located(f"{path}"):
+        try:
+            yield
+        except (ValueError, TypeError, OverflowError, KeyError) as e:
+            raise InputError(shortened(" ".join(str(e).split()))) from None
 
 
 def _meta(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any
 
 from distributed import get_worker
 
+from mortarbench.harness.checked import located
 from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.environment.environment import capture_in_worker, digest
 from mortarbench.harness.errors import InputError
@@ -75,14 +76,11 @@ def measure(
     task = worker.state.tasks[worker.get_current_task()]
     outcomes: list[Outcome] = []
     executor = Executor(commands, scratch, operators)
-    with closing(executor):
-        try:
-            for outcome in executor.execute(replace(block, turns=turns)):
-                outcomes.append(outcome)
-                if task.state != "executing":
-                    break
-        except InputError as e:  # the disk of this machine is full
-            raise InputError(f"{node}: {e}") from None
+    with closing(executor), located(node):  # the disk of this machine may be full
+        for outcome in executor.execute(replace(block, turns=turns)):
+            outcomes.append(outcome)
+            if task.state != "executing":
+                break
     return outcomes, node, environment
 
 
