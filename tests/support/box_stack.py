@@ -68,17 +68,20 @@ def global_arrays(M, H, f, mu, *, rows_first=False):
     arrays = {"spacedim": np.array([3], np.int32), "vectors/f": f, "vectors/mu": mu}
     arrays["vectors/w"] = np.zeros(H.shape[1])
     for name, matrix in (("M", np.diag(M)), ("H", H)):
-        i, j = np.nonzero(matrix)
-        p, i_ = (i, j) if rows_first else (j, i)
-        sizes = dict(nzmax=i.size, m=len(matrix), n=matrix.shape[1], nz=i.size)
-        arrays |= {
-            f"{name}/{key}": np.array([size], np.int32) for key, size in sizes.items()
-        }
-        arrays |= {
-            f"{name}/p": p.astype(np.int32), f"{name}/i": i_.astype(np.int32),
-            f"{name}/x": matrix[i, j],
-        }  # fmt: skip
+        arrays |= triplets(name, matrix, rows_first=rows_first)
     return {f"fclib_global/{name}": array for name, array in arrays.items()}
+
+
+def triplets(name, matrix, *, rows_first=False):
+    """Return the arrays of a matrix as triplets, see `global_arrays`."""
+    i, j = np.nonzero(matrix)
+    sizes = dict(nzmax=i.size, m=len(matrix), n=matrix.shape[1], nz=i.size)
+    arrays = {key: np.array([size], np.int32) for key, size in sizes.items()}
+    arrays["p"], arrays["i"] = (
+        v.astype(np.int32) for v in ((i, j) if rows_first else (j, i))
+    )
+    arrays["x"] = matrix[i, j]
+    return {f"{name}/{key}": array for key, array in arrays.items()}
 
 
 def write_boxes(path, boxes=3, mu=0.4, seed=5):

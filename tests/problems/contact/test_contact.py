@@ -16,8 +16,6 @@ from mortarbench.problems.contact.surface import divided, surface
 MASTER = np.array([[4.0, 0.0], [2.0, 0.0], [0.0, 0.0]])
 
 
-#: chain above MASTER from left to right, so that the body is above
-FLAT = np.array([[0.5, 0.25], [1.5, 0.25], [2.5, 0.25]])
 ROOF = np.array([[2.0, 0.0], [1.0, 1.0], [0.0, 0.0]])  # convex, apex on top
 
 

@@ -18,7 +18,6 @@ from mortarbench.problems.families.half_plane import (
     self_energy,
 )
 from mortarbench.problems.families.line_contact import TangentialContact
-from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -167,13 +166,6 @@ def test_dissipation_is_the_work_of_the_force_less_the_stored_energy():
     got = result(n=200, law="cattaneo", Q=-0.8, peak=0.8)["dissipation"]
 
     assert got == pytest.approx(abs(back), rel=2e-3)
-
-
-def test_an_interior_point_method_finds_the_same():
-    keys = dict(n=40, law="cattaneo", Q=0.4, peak=0.7)
-
-    ours, theirs = result(**keys), result(Clarabel(), **keys)
-    assert ours["shear_centre"] == pytest.approx(theirs["shear_centre"], rel=1e-6)
 
 
 def test_an_unused_peak_is_not_in_the_canonical_name():

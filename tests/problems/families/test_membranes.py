@@ -11,13 +11,11 @@ from scipy.sparse import issparse
 from mortarbench.harness import Solution, Status
 from mortarbench.harness.files.matfile import save_mat
 from mortarbench.harness.verify.kkt import kkt_residuals
-from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.feti_models import Membranes, hat_integrals
 from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-FAMILY = PROBLEMS["membranes"]
 #: (1/H, H/h) → numbers of torn unknowns, multipliers, contact rows and subdomains
 TABLE = {
     (1, 8): (162, 18, 9, 2), (2, 4): (200, 56, 9, 8), (2, 8): (648, 104, 17, 8),

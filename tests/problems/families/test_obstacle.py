@@ -16,7 +16,6 @@ from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-FAMILY = Obstacle()
 TOL = 1e-11
 
 

@@ -13,6 +13,7 @@ from tests.support.box_stack import (
     box_stack,
     global_arrays,
     local_arrays,
+    triplets,
     write_boxes,
     write_datasets,
 )
@@ -117,26 +118,12 @@ def test_multipliers_of_equations_are_those_of_the_eliminated_problem():
     M, H, f, mu = box_stack(2)
     rng = np.random.default_rng(1)
     G, b = rng.standard_normal((12, 2)), np.array([1e-3, 0.0])
-    arrays = global_arrays(M, H, f, mu)
-    i, j = np.nonzero(G)
-    sizes = dict(nzmax=i.size, m=12, n=2, nz=i.size)
-    arrays |= {f"fclib_global/G/{k}": np.array([n]) for k, n in sizes.items()}
-    arrays |= {
-        "fclib_global/G/p": j,
-        "fclib_global/G/i": i,
-        "fclib_global/G/x": G[i, j],
-    }
+    arrays = global_arrays(M, H, f, mu) | triplets("fclib_global/G", G)
     arrays["fclib_global/vectors/b"] = b
     inverse = np.diag(1 / M)
     local = local_arrays(H.T @ inverse @ H, H.T @ inverse @ f, mu)
-    for name, matrix in (("V", H.T @ inverse @ G), ("R", G.T @ inverse @ G)):
-        i, j = np.nonzero(matrix)
-        sizes = dict(nzmax=i.size, m=len(matrix), n=2, nz=i.size)
-        local |= {f"fclib_local/{name}/{k}": np.array([n]) for k, n in sizes.items()}
-        local |= {
-            f"fclib_local/{name}/{k}": v
-            for k, v in zip("pix", (j, i, matrix[i, j]), strict=True)
-        }
+    local |= triplets("fclib_local/V", H.T @ inverse @ G)
+    local |= triplets("fclib_local/R", G.T @ inverse @ G)
     local["fclib_local/vectors/s"] = G.T @ inverse @ f + b
     one, two = to_contact(arrays).contact, to_contact(local).contact
 

@@ -22,7 +22,6 @@ from scipy.sparse import (
 from mortarbench.harness import QP, InputError
 from mortarbench.harness.files.qpfile import explicit_matrices
 from mortarbench.harness.names import assemble, parse
-from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
@@ -74,8 +73,7 @@ ENDATA
 
 
 def solved(qp):
-    clarabel = resolve(SolverSpec(name="clarabel", label="clarabel"), SOLVERS)
-    s = clarabel.prepare(qp, 1e-10)()
+    s = SOLVERS["clarabel"].prepare(qp, 1e-10)()
     assert kkt_residuals(qp, s).worst < 1e-8
     return s
 
@@ -230,14 +228,7 @@ def test_values_that_qps_treats_as_infinite_are_not_written(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.qps", "a.MPS", "a.mat"])
 def test_a_compressed_file_is_the_file(written, tmp_path, name):
-    content = {
-        "P": np.eye(2),
-        "q": [1.0, 2.0],
-        "A": np.eye(2),
-        "l": [0, 0],
-        "u": [1, 1],
-    }
-    written(content if name == "a.mat" else QPS, name)
+    written(MAT if name == "a.mat" else QPS, name)
     plain = (tmp_path / name).read_bytes()
     (tmp_path / f"{name}.gz").write_bytes(
         gzip.compress(plain[:99]) + gzip.compress(plain[99:])

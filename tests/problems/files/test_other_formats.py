@@ -6,6 +6,7 @@ Its published optimum is 4.371875.
 """
 
 import json
+from pathlib import Path
 
 import clarabel
 import numpy as np
@@ -13,7 +14,6 @@ import pytest
 from scipy.sparse import csc_array
 
 from mortarbench.harness import InputError
-from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.files.readers import read
 from mortarbench.solvers import SOLVERS
@@ -33,8 +33,7 @@ CLARABEL = {
 
 
 def value(loaded):
-    solver = resolve(SolverSpec(name="clarabel", label="clarabel"), SOLVERS)
-    s = solver.prepare(loaded.qp, 1e-10)()
+    s = SOLVERS["clarabel"].prepare(loaded.qp, 1e-10)()
     assert kkt_residuals(loaded.qp, s).worst < 1e-8
     return loaded.scale * loaded.qp.objective(s.x) + loaded.constant
 
@@ -45,9 +44,9 @@ def loaded(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def load(content, name):
-        path = tmp_path.joinpath(name).relative_to(tmp_path)
-        path.write_text(content if isinstance(content, str) else json.dumps(content))
-        return read(path)
+        text = content if isinstance(content, str) else json.dumps(content)
+        Path(name).write_text(text)
+        return read(Path(name))
 
     return load
 
