@@ -227,62 +227,12 @@ def test_mindlin_s_problem_has_one_disc_for_each_cell_in_contact():
     assert counts == [88, 2608, 41684, 166740]
 
 
-def prototype(n, nu, Q):
-    """Return F, δ, the friction bounds and μP of Mindlin's problem for R = a = E = 1.
-
-    This independent code was written from the published formulas before the family
-    existed.
-    """
-    h, mu = 2 / 0.9 / n, 0.3
-    at = (np.arange(n) + 0.5 - n / 2) * h
-    x, y = (c.ravel() for c in np.meshgrid(at, at, indexing="ij"))
-    inside = x**2 + y**2 < 1
-    x, y = x[inside], y[inside]
-    X, Y = x[:, None] - x, y[:, None] - y
-    I0, Ixx, Iyy, Ixy = (np.zeros_like(X) for _ in range(4))
-    for i in (1, -1):
-        for j in (1, -1):
-            a, b = X + i * h / 2, Y + j * h / 2
-            r = np.hypot(a, b)
-            log_x, log_y = (
-                np.log(np.where(c < 0, d**2 / np.where(c < 0, r - c, 1), c + r))
-                for c, d in ((a, b), (b, a))
-            )
-            I0 += i * j * (a * log_y + b * log_x)
-            Ixx += i * j * b * log_x
-            Iyy += i * j * a * log_y
-            Ixy -= i * j * r
-    F = np.empty((x.size, 2, x.size, 2))
-    F[:, 0, :, 0], F[:, 1, :, 1] = (1 - nu) * I0 + nu * Ixx, (1 - nu) * I0 + nu * Iyy
-    F[:, 0, :, 1] = F[:, 1, :, 0] = nu * Ixy
-    F = F.reshape(2 * x.size, -1) * (2 * (1 + nu)) / (np.pi * h * h)
-    load = 2 / (3 * (1 - nu**2))  # 4E*/3, E* = E/2(1 − ν²)
-    pressure = 1.5 * load / np.pi * np.sqrt(1 - x**2 - y**2)
-    shift = 0.75 * mu * load * (2 - nu) * (1 + nu) * (1 - (1 - Q) ** (2 / 3))
-    return F, shift, mu * h * h * pressure, mu * load
-
-
-@pytest.mark.parametrize(
-    "nu", [0.3, *(pytest.param(nu, marks=pytest.mark.slow) for nu in (0.0, 0.45))]
-)
-def test_mindlin_s_problem_is_that_of_an_independent_prototype(nu):
-    """Forces are in units of μP, and displacements in units of μP/(πGa)."""
-    F, shift, bound, limit = prototype(12, nu, 0.7)
-    qp = built(n=12, law="mindlin", nu=nu, Q=0.7).qp
-    length = limit * 2 * (1 + nu) / np.pi
-
-    assert -qp.q[::2] == pytest.approx(shift / length, rel=1e-12)
-    assert not qp.q[1::2].any()
-    assert qp.sets[1].radius == pytest.approx(bound / limit, rel=1e-12)
-    P = qp.P @ np.eye(qp.q.size)
-    assert pytest.approx(F * (limit / length), rel=1e-11, abs=1e-9) == P
-
-
 @pytest.mark.parametrize(
     ("n", "nu", "Q", "c_over_a", "error"),
     [
         (64, 0.0, 0.5, 0.0069, 2e-4),
         (64, 0.0, 0.9, 0.0059, 2e-4),
+        (64, 0.3, 0.5, 0.0069, 6e-4),
         *(pytest.param(256, 0.0, Q, error, 1e-4, marks=pytest.mark.slow)
           for Q, error in ((0.1, 0.0009), (0.3, 0.0009), (0.5, 0.0016), (0.7, 0.0018),
                            (0.9, 0.0028))),
