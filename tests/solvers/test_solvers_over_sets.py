@@ -78,7 +78,7 @@ def faults(name, shape, seeds):
 
 @pytest.mark.parametrize(("name", "shape"), PAIRS)
 @pytest.mark.parametrize(
-    "count", [1, pytest.param(250, marks=pytest.mark.slow)], ids=["one", "many"]
+    "count", [1, pytest.param(100, marks=pytest.mark.slow)], ids=["one", "many"]
 )
 def test_planted_solutions_over_sets_are_found(name, shape, count):
     """A solver may decline all QPs of a shape, for example because of their rows."""

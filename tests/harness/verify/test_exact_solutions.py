@@ -159,7 +159,7 @@ IN_SPACE = (
     ("name", "count"),
     [
         (IN_SPACE[0], 16),
-        *(pytest.param(name, 200, marks=pytest.mark.slow) for name in IN_SPACE),
+        *(pytest.param(name, 60, marks=pytest.mark.slow) for name in IN_SPACE),
     ],
 )
 def test_no_error_in_space_exceeds_its_bound(name, count):
@@ -202,7 +202,7 @@ def solved(name: str, labels=tuple(SOLVERS)):
 
 @pytest.mark.parametrize(
     ("count", "names"),
-    [(16, QUICK), pytest.param(200, CASES, marks=pytest.mark.slow)],
+    [(16, QUICK), pytest.param(50, CASES, marks=pytest.mark.slow)],
 )
 def test_no_error_exceeds_its_bound_and_bounds_are_sharp(count, names):
     sharp = []
@@ -242,7 +242,7 @@ def test_no_error_of_any_solver_exceeds_its_bound(name):
     ("count", "names"),
     [
         (8, (*UNASSEMBLED[1:4:2], UNASSEMBLED[-3])),
-        pytest.param(100, UNASSEMBLED, marks=pytest.mark.slow),
+        pytest.param(40, UNASSEMBLED, marks=pytest.mark.slow),
     ],
 )
 def test_no_error_exceeds_its_bound_without_an_assembled_matrix(count, names):
