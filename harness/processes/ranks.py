@@ -176,7 +176,8 @@ class Ranks:
         if self.case is None or (s.status is Status.FAILED and not has_point(s)):
             return {"status": Verdict(s.status)}, []
         # factors that code of a solver may have reached are not used
-        self.case.qp.P.forget()
+        if hasattr(self.case.qp.P, "forget"):
+            self.case.qp.P.forget()
         return evaluated(self.case, s, tol)
 
 

@@ -21,6 +21,8 @@ from mortarbench.problems.fem.mesh import dofs_of
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdomains import DecomposedProblem
 
+EPS = float(np.finfo(float).eps)
+
 
 def torn_mechanics(
     served: Served, K: csc_array | None = None
@@ -74,7 +76,9 @@ def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
             else np.full((len(points), 1), len(points) ** -0.5)
         )
         at = d * np.searchsorted(of_body, fixed) + axes
-        allowed = R @ null_space(R[at]) if at.size else R.copy()
+        # the R factor has the same kernel; an SVD of R[at] would form a square matrix
+        rows = np.linalg.qr(R[at], mode="r")
+        allowed = R @ null_space(rows, rcond=EPS * max(R[at].shape))
         if not allowed.shape[1]:  # the supports prevent all motions
             continue
         allowed[at] = 0
