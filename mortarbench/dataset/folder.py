@@ -103,7 +103,8 @@ def check(folder: str | Path) -> tuple[str, ...]:
     """Check a folder of the set, and return what is wrong, a line for each file.
 
     Digests are compared, and every optimum, infeasibility and unboundedness is proven
-    again from the problem and its certificate.
+    again from the problem and its certificate. All else in the catalogue is compared
+    with the published one.
 
     Raises
     ------
@@ -119,9 +120,13 @@ def check(folder: str | Path) -> tuple[str, ...]:
     names = (CATALOGUE, *COPIED, *(row["path"] for row in rows))
     changed = [name for name in names if _digest(path / name) != expected.get(name)]
     found = [f"{name}: missing, or changed since the build" for name in changed]
+    published = catalogue()
     with one_thread():
         for row in (row for row in rows if row["path"] not in changed):
-            found += [f"{row['path']}: {text}" for text in _unproven(path, row)]
+            wrong = [*_unproven(path, row)]
+            if not wrong and row not in published:
+                wrong = ["its line of the catalogue is not the published one"]
+            found += [f"{row['path']}: {text}" for text in wrong]
     return tuple(found)
 
 

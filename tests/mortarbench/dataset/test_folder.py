@@ -114,6 +114,7 @@ def test_a_missing_file_is_found(copy, capsys, name):
         ("torsion-n12-primal", {"kind": lambda _: "infeasible"}, "not prove"),
         ("torsion-n12-primal", {"kind": lambda _: "nice"}, "cannot be checked"),
         ("torsion-n12-primal", {"optimum": lambda _: "low"}, "cannot be checked"),
+        ("torsion-n12-primal", {"active_share": lambda _: "0.9"}, "not the published"),
     ],
 )
 def test_a_changed_claim_is_refuted(copy, capsys, name, changes, message):
