@@ -148,6 +148,8 @@ cdef class SMALBE(MPRGP):
                 memcpy(basis.U + r * n, read(ritz.vectors, owners), kept * n * sizeof(double))
             for i in range(r, r + kept):  # vectors of an earlier QP have other rows C
                 rows_times(basis.U, basis.U + i * n, basis.c, i, n)
+                if dot(basis.c, basis.c, i) <= 1e-24:  # rounding
+                    continue
                 add_combination(-1.0, basis.U, basis.c, basis.U + i * n, i, n)
                 scale(1 / (sqrt(dot(basis.U + i * n, basis.U + i * n, n)) or 1.0),
                       basis.U + i * n, n)
@@ -210,7 +212,7 @@ cdef class SMALBE(MPRGP):
 
         The gradient includes Cᵀμ. The call takes one product, or no product for x = 0,
         where 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν. Infinite components of x start at their bound,
-        or at x̃ if it is infinite. A start ν ≠ −x̃ also moves towards Cν = 0 on its face.
+        or at x̃ if it is infinite. A start x ≠ 0 also moves towards Cν = 0 on its face.
         """
         cdef Py_ssize_t i, n = self.n
         cdef list owners = []
@@ -222,14 +224,16 @@ cdef class SMALBE(MPRGP):
         if rho != self.rho:
             self.directions.begin(self.free)  # H has changed
         self.rho = rho
-        self.set.project(read(x, owners), 1.0, self.rows.x_tilde, nu)
+        cdef const double *start_x = read(x, owners)
+        self.set.project(start_x, 1.0, self.rows.x_tilde, nu)
         for i in range(n):
             if isinf(nu[i]):
                 nu[i] = fmin(fmax(0.0, self.lower[i]), self.upper[i])
             moved = moved or nu[i] + self.rows.x_tilde[i] != 0
         if moved:
-            self.set.split(nu, nu, 1.0, self.phi, self.free, &parts)
-            self.move_onto_rows(nu, self.free, self.s)
+            if dot(start_x, start_x, n):
+                self.set.split(nu, nu, 1.0, self.phi, self.free, &parts)
+                self.move_onto_rows(nu, self.free, self.s)
             self.H(nu, g)
         else:  # 𝒫F𝒫ν = 0
             self.rows.times(nu, self.Cv)
