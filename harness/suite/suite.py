@@ -136,7 +136,7 @@ def suite_file(table: Mapping[str, Any]) -> SuiteFile:
     except msgspec.ValidationError as e:
         message, _, path = str(e).partition(" - at `$")
     path = path.removeprefix(".").removesuffix("`")
-    quoted = re.findall("`(.+?)`", message)
+    quoted = re.findall("`(.*?)`", message)
     if message.startswith("Object contains unknown field"):
         kind = {"": SuiteFile, "s": Entry, "p": Problem}[path[:1]]
         raise unknown("key", quoted[0], kind.__struct_fields__, where=path)

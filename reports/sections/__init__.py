@@ -94,7 +94,8 @@ def _answer(run: Measurements, found: list[Row], name: str, title: str) -> Secti
 
 def machine(run: Measurements, digest: str) -> str:
     """Describe the machine of an environment in a few words."""
-    facts = run.environments.get(digest, {}).get("machine") or {}
+    facts = run.environments.get(digest, {}).get("machine")
+    facts = facts if isinstance(facts, dict) else {}
     parts = [str(facts.get("cpu") or "machine unknown")]
     if facts.get("usable_cores"):
         parts.append(f"{facts['usable_cores']} cores")
