@@ -438,12 +438,12 @@ cdef class SMALBE(MPRGP):
         """Move ν towards Cν = 0 on the face with the mask `free`; v (n,) is workspace.
 
         Projections onto {Cν = 0} and onto the free components alternate (von Neumann)
-        as long as a pair halves ‖Cν‖. Active bounds and discs remain active.
+        as long as a pair reduces ‖Cν‖ by a fifth. Active bounds and discs remain active.
         """
         cdef double error, before = INFINITY
         self.rows.times(nu, self.Cv)
         error = self.rows.size(self.Cv)
-        while 0 < 2 * error < before:
+        while 0 < 1.25 * error < before:
             memset(v, 0, self.n * sizeof(double))
             self.rows.add(1.0, self.Cv, v)
             masked(free, v, v, self.n)
@@ -460,9 +460,9 @@ cdef class SMALBE(MPRGP):
         First, ν moves towards Cν = 0 on its face, because the outer loop ends with ‖Cν‖
         of the order of the tolerance, which is the error of the force balance.
 
-        For a = ‖𝒫F𝒫‖(μ + ρCν) − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient of the
-        projected problem up to rounding and terms of the order of ‖Cν‖. On the free
-        components, where the residual must vanish, a least-squares correction of a
+        For a = ‖𝒫F𝒫‖(μ + ρCν) − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient
+        of the projected problem up to rounding and terms of the order of ‖Cν‖. On the
+        free components, where the residual must vanish, a least-squares correction of a
         removes these errors.
         """
         cdef Py_ssize_t i, j, k, n = self.n, r = self.rows.r
