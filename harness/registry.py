@@ -317,8 +317,8 @@ def option_value(where: str, value: Any, solver: Solver, key: str) -> Any:
     # scalars of NumPy have an empty shape
     plain = value.item() if getattr(value, "shape", None) == () else value
     for kind in kinds:
-        # a TypeError is raised for a class of a plug-in
-        with suppress(msgspec.ValidationError, TypeError):
+        # a TypeError is raised for a class of a plug-in, a UnicodeError for bad texts
+        with suppress(msgspec.ValidationError, TypeError, UnicodeError):
             return msgspec.convert(plain, kind, strict=not is_text)
     names: list[str] = []
     for kind in kinds:

@@ -10,15 +10,14 @@ pytestmark = pytest.mark.together  # one process lists the modules that it impor
 PLUGIN = """
 from dataclasses import dataclass
 import numpy as np
-from harness import QP, Solution, Status
-from solvers import FACTOR
+from mortarbench import QP, Solution, Status
+from factors import FACTOR
 
 @dataclass(frozen=True)
 class Exact:
     def declines(self, qp: QP):
         return "has rows" if qp.b.size or qp.h.size else None
     def prepare(self, qp, tol):
-        from harness import no_rows
         x = np.clip(-FACTOR * qp.q / qp.P.diagonal(), qp.lb, qp.ub)
         z_box = -qp.P @ x - qp.q
         none = np.zeros(0)
@@ -56,7 +55,7 @@ def folder_of_user(tmp_path_factory):
         file.write_text("OF_USER = True\n")
     (folder / "mine").mkdir()
     (folder / "mine" / "plug.py").write_text(PLUGIN)
-    (folder / "mine" / "solvers.py").write_text("FACTOR = 1.0\n")
+    (folder / "mine" / "factors.py").write_text("FACTOR = 1.0\n")
     (folder / "script.py").write_text(PROGRAM)
     return folder
 
