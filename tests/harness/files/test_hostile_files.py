@@ -410,7 +410,7 @@ KINDS = ("npz", "mat", "parquet", "qps", "json", "hdf5")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [10, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [30, pytest.param(500, marks=pytest.mark.slow)])
 def test_no_damaged_file_causes_a_crash_or_hang_or_runs_code(tmp_path, kind, count):
     survived = fuzz(kind, count, 12, tmp_path, seconds=120)
 

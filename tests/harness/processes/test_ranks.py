@@ -48,6 +48,7 @@ def assert_equal_answers(alone, answer, ranks):
     u, v = (alone.case.family_case.recover(a.solution) for a in (alone, answer))
     assert abs(u - v).max() <= 10 * TOL * abs(u).max()
     assert 0 < answer.energy_bound == pytest.approx(alone.energy_bound, rel=0.1)
+    assert answer.energy_bound <= max(1e-5, 1.01 * alone.energy_bound)
     assert answer.record.objective == pytest.approx(alone.record.objective, rel=1e-9)
     assert answer.quantities.keys() == alone.quantities.keys()
     assert answer.quantities["energy"] == pytest.approx(alone.quantities["energy"])

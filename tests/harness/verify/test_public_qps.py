@@ -1,7 +1,8 @@
-"""Verdicts on public QPs of Maros and Mészáros (1999).
+"""Verdicts on planted points and on public QPs of Maros and Mészáros (1999).
 
-The data are in ../shared, which is not part of the project. Units that do not depend on
-the rule follow from `verdict_rule.equilibrate`.
+The data and the search on planted points are in ../shared, which is not part of the
+project. Units that do not depend on the rule are those of the search, or follow from
+`verdict_rule.equilibrate`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from mortarbench.harness.verify.kkt import allowed, kkt_residuals
 from mortarbench.solvers import SOLVERS
 from tests.support import ROOT
 from tests.support.limited_solves import limited_solves
+from tests.support.small_qps import at
 
 SHARED = ROOT.parent / "shared"
 MAROS = sorted((SHARED / "data" / "maros").glob("*.QPS"))
@@ -51,6 +53,30 @@ def verified(qp: QP, s: Solution, tol: float) -> bool:
 @cache
 def qp_of(path: Path) -> QP:
     return mb.build(f"file:{path}").family_case.qp
+
+
+# --- planted points -------------------------------------------------------------------
+
+
+def test_at_most_four_in_a_thousand_planted_points_are_judged_wrongly():
+    """The search contains 7500 wrong and 5000 right points; rates were 0.07, 0.12 %."""
+    planted, total = tool("planted_points"), Counter()
+
+    def is_verified(data, point, tol):
+        P, q, A, b, G, h, lb, ub = data
+        qp = QP(P=(P + P.T) / 2, q=q, A=A, b=b, G=G, h=h, lb=lb, ub=ub)
+        return verified(qp, at(*point), tol)
+
+    for seed in range(1, 11):
+        total.update(planted.search(is_verified, 150, seed)[0])
+
+    assert total["wrong"] > 7000
+    assert total["right"] > 4500
+    assert total["false verified"] <= 0.004 * total["wrong"]
+    assert total["false refuted"] <= 0.004 * total["right"]
+
+
+# --- answers of solvers ---------------------------------------------------------------
 
 
 @cache
@@ -126,3 +152,59 @@ def test_verdicts_on_answers_of_solvers_agree_with_the_optimum():
     assert wrong <= EXCEPTIONS.keys()
     assert len(EXCEPTIONS) <= 2
     assert len(refuted) <= 0.01 * count["right"], refuted
+
+
+# --- damaged points -------------------------------------------------------------------
+
+
+def accurate(path: Path) -> Solution:
+    qp = qp_of(path)
+    answers = [SOLVERS[name].prepare(qp, 1e-12)() for name in ("clarabel", "piqp")]
+    best = min(answers, key=lambda s: kkt_residuals(qp, s).worst)
+    assert kkt_residuals(qp, best).worst <= 1e-8, path.stem
+    return best
+
+
+def test_few_damaged_points_of_public_qps_are_verified():
+    """Points are damaged in units in which the QP is balanced.
+
+    Damaged multipliers count if they change the gradient by more than 100·tol of the
+    largest force.
+    """
+    planted, rng = tool("planted_points"), np.random.default_rng(0)
+    count, passed = 0, []
+    for path in MAROS:
+        qp, by, s = qp_of(path), units(path), accurate(path)
+        P, A, G = (
+            scale[:, None] * csr_array(M).toarray() * by.D
+            for scale, M in ((by.D, qp.P), (by.E, qp.A), (by.F, qp.G))
+        )
+        c = 1 / max(np.abs(P).max(), np.abs(by.D * qp.q).max())
+        lb, ub = qp.lb / by.D, qp.ub / by.D
+        data = [c * P, c * by.D * qp.q, A, by.E * qp.b, G, by.F * qp.h, lb, ub]
+        x = np.clip(s.x / by.D, lb, ub)
+        point = [x, c * s.y / by.E, c * s.z / by.F, c * by.D * s.z_box]
+        active = point[2] > 1e-8 * max(1e-300, np.abs(point[2]).max(initial=0))
+        value = x @ data[0] @ x / 2 + data[1] @ x
+        force = max(np.abs(data[0] @ x).max(), np.abs(data[1]).max())
+        force = max(force, 0.1 * np.abs(data[0]).max() * np.abs(x).max())
+        for tol in TOLERANCES * 3:
+            for label, kind, moved in planted.points(rng, data, point, active, tol):
+                error, off = planted.truth(data, moved, x, tol, value, label)
+                wrong = max(error, off) > 100 * tol
+                if kind == 2:  # other multipliers
+                    dy, dz, dbox = (moved[k] - point[k] for k in (1, 2, 3))
+                    change = A.T @ dy + G.T @ dz + dbox
+                    wrong = np.abs(change).max() > 100 * tol * force
+                if not wrong:
+                    continue
+                back = at(
+                    by.D * moved[0], by.E * moved[1] / c, by.F * moved[2] / c,
+                    moved[3] / by.D / c,
+                )  # fmt: skip
+                count += 1
+                if verified(qp, back, tol):
+                    passed.append((path.stem, tol, label, error, off))
+
+    assert count > 1000
+    assert len(passed) <= 0.025 * count, passed
