@@ -32,7 +32,7 @@ SPARSE = (
     "torsion/n=200", "obstacle/n=40", "obstacle/n=257/shape=hemisphere",
 )  # fmt: skip
 OURS = (
-    "smalbe", "smalbe-direct", "pdas", "projected-gradient",
+    "smalbe", "pdas", "projected-gradient",
 )  # fmt: skip
 
 

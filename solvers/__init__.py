@@ -6,7 +6,6 @@ from mortarbench.harness.registry import Registry, check_solver
 #: module of this package and name of a solver, or of its class
 _PLACES = {
     "smalbe": "smalbe.solver:SMALBE",
-    "smalbe-direct": "smalbe.direct:Direct",
     "smalbe-textbook": "smalbe.textbook:Textbook",
     "smalbe-permon": "smalbe.textbook:PERMON",
     "smalbe-espreso": "smalbe.textbook:ESPRESO",

@@ -31,7 +31,6 @@ MODULES = {
     "mortarbench.problems.fem.elimination": ["-ffp-contract=off"],
     # sums may be reordered for vectorisation; inf and NaN keep their meaning
     "mortarbench.solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
-    "mortarbench.solvers.smalbe.faces": ["-fassociative-math", "-fno-signed-zeros"],
 }
 
 

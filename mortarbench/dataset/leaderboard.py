@@ -21,7 +21,7 @@ KINDS = {
 GROWTH = "growing loads, bounds"
 #: Solvers that are measured unless others are requested.
 FLEET = (
-    "smalbe", "smalbe-direct", "pdas", "osqp", "clarabel", "proxqp", "piqp", "daqp",
+    "smalbe", "pdas", "osqp", "clarabel", "proxqp", "piqp", "daqp",
     "qpalm", "qoco", "qtqp", "scs", "highs",
 )  # fmt: skip
 

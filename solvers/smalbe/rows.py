@@ -42,8 +42,6 @@ Mask: TypeAlias = NDArray[np.bool_]
 #: largest error of consistent rows, relative to ‖x̃‖∞ + ‖e‖∞, for normalised rows
 CONSISTENCY_TOL = 1e-8
 RANK = 1e-13  #: squared pivots of normalised rows below this value count as rounding
-#: singular values of C on a face below this fraction of the largest one count as zero
-FREE_RANK = 1e-10
 #: largest number of rows with entries in bounded components, whose block is dense
 MAX_BORDER = 2000
 #: a sparse G stays sparse if m·n exceeds this value

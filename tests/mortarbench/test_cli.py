@@ -510,7 +510,7 @@ def test_a_complete_quiet_run_prints_nothing(cli):
 
 def test_the_dual_that_a_decline_names_is_solved(capsys):
     case = "beam-ring/Nr=2/Nh=2/steps=1"
-    main(Registries(), ["solve", f"{case}/primal", "--solver", "smalbe-direct"])
+    main(Registries(), ["solve", f"{case}/primal", "--solver", "smalbe"])
     named = capsys.readouterr().err.rpartition("solve ")[2].strip()
 
-    assert main(Registries(), ["solve", named, "--solver", "smalbe-direct"]) == 0
+    assert main(Registries(), ["solve", named, "--solver", "smalbe"]) == 0

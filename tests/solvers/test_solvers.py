@@ -42,7 +42,7 @@ CONCRETE = {name: s for name, s in SOLVERS.items() if "*" not in name} | {
 }
 WILDCARDS = ("qpsolvers:*", "cvxpy:*")
 #: active-set methods, whose accuracy does not depend on the tolerance
-EXACT = ("daqp", "highs", "smalbe-direct")
+EXACT = ("daqp", "highs")
 SPARSE = (
     "osqp", "clarabel", "proxqp", "piqp", "highs-hipo", "scs", "qpalm", "qoco", "qtqp",
 )  # fmt: skip
