@@ -8,11 +8,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 BIN := .venv/bin
 
-# backends that represent the wildcards qpsolvers:* and cvxpy:* of the registry
-BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip \
-    cvxpy:CLARABEL cvxpy:HIGHS
-
-.PHONY: help setup browser demo test mutants bench site weaknesses size synthetic check clean
+.PHONY: help setup browser demo test mutants bench site size synthetic check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -52,10 +48,6 @@ mutants: setup  ## make small changes to chosen modules; their tests must fail (
 bench: setup  ## time our own kernels (pytest-benchmark)
 	$(BIN)/pytest benchmarks --benchmark-warmup=on \
 	    --benchmark-sort=name --benchmark-columns=min,median,iqr,rounds
-
-weaknesses: setup  ## measure effects of equivalent formulations, for the site (minutes)
-	@mkdir -p out
-	@$(BIN)/mortarbench test-solver '*' $(BACKENDS) --markdown > out/weaknesses.md
 
 size: setup  ## measure time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py

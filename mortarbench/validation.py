@@ -152,6 +152,15 @@ class Conformance:
         ]
         return {"solver": self.solver, "conforms": self.conforms, "checks": checks}
 
+    def to_markdown(self) -> str:
+        """Return a list of the failed checks and the weaknesses."""
+        lines = [
+            f"- {r.grade}: {name}: {r.message}"
+            for name, r in self.results.items()
+            if r.grade in ("weak", "fail")
+        ]
+        return "\n".join([f"## {self.solver}", "", *lines])
+
     def __repr__(self) -> str:
         from mortarbench.harness.conformance.conformance import Grade
 

@@ -177,7 +177,7 @@ def test_the_harness_names_no_solver_and_no_unit_of_physics():
     converters = [text for path, text in found if path == "harness/qp.py"]
     assert all("cvxpy" in text or text == "OSQP" for text in converters)
     assert {path for path, _ in found} - {"harness/qp.py"} == {
-        "harness/conformance/equivalence.py"
+        "harness/conformance/metamorphic.py"
     }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_array, diags_array, eye_array, kron
 
-from mortarbench.harness.qp import QP, Matrix, Structure, Vector, no_rows
+from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution, Status
@@ -198,66 +198,6 @@ def membrane(k: int) -> QP:
         csc_array(kron(second, eye) + kron(eye, second)),
         np.full(k * k, 8 / (k + 1) ** 2),
         lb=(-0.1 - 0.3 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)).ravel(),
-    )
-
-
-FORMS = ("primal", "dual", "dual-bounds")  #: forms of `strings`
-
-
-def strings(form: str) -> QP:
-    """Return the QP of a loaded string in frictionless contact with a softer string.
-
-    The upper string has 24 cells, and the lower string has 16 cells. The unknown is the
-    deflection u at the 25 + 17 nodes; K is the stiffness and f the load. The primal
-    problem is min ½uᵀKu − fᵀu  subject to  A u = 0,  G u ≤ h.  A u = 0 fixes the ends.
-    Each row of G u ≤ h keeps an inner node of the upper string above the lower string.
-    The entries of the row are −1 at this node and interpolation weights at two nodes of
-    the lower string.
-
-    form : "primal" is the primal problem. "dual", with B = [A; G], c = [0; h] and an
-        orthonormal basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  subject to RᵀBᵀλ
-        = Rᵀf,  λ_I ≥ 0,  where λ_I are the multipliers of G. "dual-bounds" is the dual
-        after elimination of the fixed ends; its only constraint is λ ≥ 0
-    """
-    K, R = np.zeros((42, 42)), np.zeros((42, 2))
-    for body, (tension, cells, nodes) in enumerate(
-        [(2.0, 24, slice(0, 25)), (0.5, 16, slice(25, 42))]
-    ):
-        stretch = np.diff(np.eye(cells + 1), axis=0)
-        K[nodes, nodes] = tension * cells * stretch.T @ stretch
-        R[nodes, body] = 1 / np.sqrt(cells + 1)
-    f = np.zeros(42)
-    f[1:24] = -1 / 24  # the load acts on the upper string only
-    upper, lower = np.arange(1, 24), np.linspace(0, 1, 17)
-    at = upper / 24
-    weights = [np.interp(at, lower, hat) for hat in np.eye(17)]
-    G = np.hstack([-np.eye(25)[1:-1], np.transpose(weights)])
-    h = 0.01 + 0.1 * (at - 0.4) ** 2
-    ends = np.array([0, 24, 25, 41])
-    A = np.eye(42)[ends]
-    if form == "primal":
-        return QP.from_arrays(
-            csc_array(K), -f, csc_array(G), h, csc_array(A), np.zeros(4)
-        )
-    free = np.setdiff1d(np.arange(42), ends)
-    if form == "dual":
-        B, c, fixed = np.vstack([A, G]), np.append(np.zeros(4), h), ends[:0]
-        inverse = np.linalg.pinv(K, hermitian=True)
-    else:
-        B, c, fixed, inverse = G, h, ends, np.zeros((42, 42))
-        inverse[np.ix_(free, free)] = np.linalg.inv(K[np.ix_(free, free)])
-        R = R[:, :0]
-    F, m = B @ inverse @ B.T, c.size
-    return QP(
-        P=(F + F.T) / 2,
-        q=c - B @ inverse @ f,
-        A=R.T @ B.T,
-        b=R.T @ f,
-        G=no_rows(m),
-        h=np.zeros(0),
-        lb=np.where(np.arange(m) < m - h.size, -np.inf, 0),
-        ub=np.full(m, np.inf),
-        structure=Structure(K=csc_array(K), B=csc_array(B), fixed=fixed),
     )
 
 

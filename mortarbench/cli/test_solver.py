@@ -27,7 +27,7 @@ def test_solver(
     Exit code 1: a check fails, or a solver solves no QP.
 
     solvers : a solver, or a pattern such as 'p*'
-    markdown : print only how answers change under equivalent formulations, as a page
+    markdown : print only the failed checks and the weaknesses, as a Markdown list
     json : print JSON
     """
     if markdown and json:
@@ -35,26 +35,18 @@ def test_solver(
     names = [n for pattern in solvers for n in _named(pattern, registries.solvers)]
     for name in names:
         check_name(name, registries.solvers)
-    from mortarbench.harness.conformance.conformance import CHECKS, INVARIANCE_PREFIX
-    from mortarbench.harness.conformance.weaknesses import weaknesses_page
-
-    changes = [c for c in CHECKS if c.startswith(INVARIANCE_PREFIX)]
     results = []
     for name in names:
         with waiting() as progress:
             result = mb.test_solver(
                 name,
-                checks=changes if markdown else None,
                 progress=progress,
                 registries=registries,
                 **arguments,
             )
         results.append(result)
-        if not json and not markdown:
-            print(result)
-    if markdown:
-        print(weaknesses_page({one.solver: one.results for one in results}), end="")
-        return 0
+        if not json:
+            print(result.to_markdown() if markdown else result)
     if json:
         print(dumps([row for one in results for row in one.to_dict()["checks"]]))
     for one in results:

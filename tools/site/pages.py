@@ -37,7 +37,6 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }  #: pages of the site by the name of the file in the root of the project
-WEAKNESSES = ROOT / "out" / "weaknesses.md"  #: page that `make weaknesses` measures
 #: formula in the output of pymdownx.arithmatex, displayed or inline
 FORMULA = re.compile(
     r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', re.DOTALL
@@ -58,10 +57,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, page, content=text))
     for page, build in GENERATED.items():
         files.append(File.generated(config, page, content=build()))
-    if WEAKNESSES.is_file():
-        content = WEAKNESSES.read_text("utf-8")
-        files.append(File.generated(config, WEAKNESSES.name, content=content))
-        config.nav = [*(config.nav or ()), {"Weaknesses of solvers": WEAKNESSES.name}]
     for notebook in sorted((ROOT / "docs" / "gallery").glob("*.ipynb")):
         for path, content in gallery_page(notebook).items():
             files.append(File.generated(config, path, content=content))

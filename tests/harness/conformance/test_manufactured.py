@@ -93,7 +93,7 @@ OF_BOTH = [check for check in OVER_SETS if " and " in check]
     ],
 )
 def test_checks_over_sets_pass_the_reference_and_catch_faults(check):
-    grade, message, _ = run_check(check, Projections())
+    grade, message = run_check(check, Projections())
     assert grade is Grade.PASS, message
     for faulty in (OnBounds(), OtherSign(), Stops()):
         assert run_check(check, faulty).grade is Grade.FAIL
