@@ -297,7 +297,7 @@ def run(
         a list, each value in the list is measured
     fresh : delete the previous results in the folder first
     dask : measure on the workers of the Dask scheduler at this address, or (``local``)
-        of a scheduler that is started on this machine; see docs/compare.md
+        of a cluster that is started on this machine; see docs/compare.md
     plugins : Python files with more solvers or families
     progress : True for a bar, or for lines if stderr is not a terminal; a function to
         be called with every `Event`; False for no display; None for a bar in a notebook
@@ -388,9 +388,8 @@ def run(
                     operators=registries.own_operators,
                     environment=environment,
                     keep=lambda name, there: keep_environment(folder, name, there),
-                    warn=display.warn,
                 )
-            ).execute
+            )
         missing = run_suite(
             asked,
             out=folder,

@@ -10,47 +10,65 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
-import sys
+import platform
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
-from functools import partial
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import replace
+from functools import lru_cache, partial
+from itertools import islice
 from pathlib import Path
-from subprocess import DEVNULL, Popen
-from tempfile import TemporaryDirectory
+from threading import Lock
 from typing import Any
 
-from mortarbench.harness.environment.environment import digest, packages_of
+from mortarbench.harness.checked import located
+from mortarbench.harness.environment.cpus import fastest_first
+from mortarbench.harness.environment.environment import (
+    capture_in_worker,
+    digest,
+    packages_of,
+)
 from mortarbench.harness.environment.labels import in_words
-from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import InputError, described, one_line
 from mortarbench.harness.operators import Maker
-from mortarbench.harness.registry import PluginFile
+from mortarbench.harness.processes.scratch import scratch_folder
+from mortarbench.harness.registry import PluginFile, load_plugin, merged
 from mortarbench.harness.results.folder import differences
 from mortarbench.harness.results.work_unit import (
     BuildFailure,
     Commands,
+    Execute,
     Outcome,
     WorkUnit,
 )
+from mortarbench.harness.running.executor import execute
 
 LOCAL = "local"
 CONNECT_SECONDS = 10  #: time limit for connecting
-#: longest time between two checks for workers that joined or were lost
-CLUSTER_POLL_SECONDS = 2.0
-LOST_SECONDS = 30.0  #: time in which a lost worker may be replaced
+CLUSTER_POLL_SECONDS = 2.0  #: longest time between two checks for lost workers
+LOST_SECONDS = 30.0  #: time in which the first worker may join, or a lost one return
 
 #: keys of an environment in which all nodes must agree to run the same code
 _CODE = ("source", "versions.mortarbench", "plugins")
+_TURN = Lock()  #: held while this Dask worker measures a block
 
 
 @contextmanager
-def on_cluster(address: str, **settings: Any) -> Iterator[Cluster]:
-    """Connect to a Dask cluster, before a result folder is created.
+def on_cluster(
+    address: str,
+    *,
+    plugins: Sequence[PluginFile],
+    operators: Mapping[str, Maker],
+    environment: Mapping[str, Any],
+    keep: Callable[[str, Mapping[str, Any]], None],
+) -> Iterator[Execute]:
+    """Connect to a Dask cluster, and provide a function that executes blocks there.
 
     address : address of a scheduler, or "local" to start a scheduler with a worker for
         each CPU that this process may use
-    settings : further fields of `Cluster`
+    operators : makers of operators P, except those of `plugins`
+    environment : environment of this process
+    keep : stores the environment of a node by its digest
 
     Raises
     ------
@@ -58,171 +76,160 @@ def on_cluster(address: str, **settings: Any) -> Iterator[Cluster]:
         If Dask is not installed, or the scheduler does not answer.
 
     """
-    try:
-        from distributed import Client, LocalCluster
-    except ImportError:
-        raise InputError(
-            "--dask needs the package distributed, which is not installed; "
-            "pip install -c constraints.txt -e '.[cluster]'"
-        ) from None
     # Dask would also log the errors that are reported here, with tracebacks.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with ExitStack() as stack:
-        where: Any = address
-        if address == LOCAL:
-            where = LocalCluster(
-                n_workers=0,
-                # use any free port, so that several clusters can coexist
-                dashboard_address="127.0.0.1:0",
-                scheduler_kwargs={"dashboard": False},
-                silence_logs=logging.CRITICAL,
-            )
-            stack.enter_context(where)
-            stack.enter_context(_local_workers(where.scheduler_address))
         try:
+            from distributed import Client, LocalCluster
+
+            where: Any = address
+            if address == LOCAL:
+                where = LocalCluster(
+                    n_workers=len(os.sched_getaffinity(0)),
+                    threads_per_worker=1,
+                    memory_limit=0,
+                    dashboard_address="127.0.0.1:0",  # any free port
+                    silence_logs=logging.CRITICAL,
+                )
+                stack.enter_context(where)
             client = stack.enter_context(Client(where, timeout=CONNECT_SECONDS))
         # the library of each address scheme raises its own exceptions
         except Exception as e:
-            why = " ".join(str(e).split()) or type(e).__name__
             raise InputError(
-                f"--dask {address}: no scheduler answers ({why}); expected 'local', or "
-                "the address that `dask scheduler` prints, such as tcp://HOST:8786"
+                f"--dask {address}: {one_line(described(e))}; expected 'local' or the "
+                "address that `dask scheduler` prints, such as tcp://HOST:8786, and "
+                "the package distributed (pip install -e '.[cluster]')"
             ) from None
-        yield Cluster(client=client, address=address, **settings)
-
-
-@contextmanager
-def _local_workers(scheduler: str) -> Iterator[None]:
-    """Start a Dask worker for each usable CPU, which Ctrl-C does not reach."""
-    with TemporaryDirectory(prefix="mortarbench-") as folder:
-        command = [sys.executable, "-P", "-m", "dask", "worker", scheduler]
-        command += ["--nworkers", str(len(os.sched_getaffinity(0))), "--nthreads", "1"]
-        command += ["--memory-limit", "0", "--no-dashboard", "--death-timeout", "30"]
-        command += ["--local-directory", folder]
-        workers = Popen(command, stdout=DEVNULL, stderr=DEVNULL, start_new_session=True)
-        try:
-            yield
-        finally:
-            os.killpg(workers.pid, signal.SIGKILL)
-            workers.wait()
-
-
-@dataclass(eq=False, kw_only=True)
-class Cluster:
-    """Connection to a Dask cluster that executes the blocks of one run."""
-
-    client: Any
-    address: str
-    plugins: Sequence[PluginFile]
-    operators: Mapping[str, Maker]  #: makers of operators P, except those of `plugins`
-    environment: Mapping[str, Any]  #: environment of this process
-    keep: Callable[[str, Mapping[str, Any]], None]  #: stores an environment by digest
-    warn: Callable[[str], None]  #: called with each message to the user, a single line
-    _stored: set[str] = field(default_factory=set)  # digests of stored environments
-
-    def execute(
-        self, blocks: Iterator[WorkUnit], commands: Commands, scratch: Path
-    ) -> Generator[Outcome]:
-        """Execute all blocks, and yield the outcomes of a block when it is complete.
-
-        Raises
-        ------
-        InputError
-            If a node is unsuitable, or if the scheduler or all workers are lost.
-
-        """
-        from distributed import KilledWorker, wait
-
-        pending: dict[Any, WorkUnit] = {}  # submitted blocks by future
-        try:
-            self._await_workers(None)
-            task = self._task(commands)
-            while True:
-                self._await_workers(LOST_SECONDS)
-                free = len(self.client.nthreads()) - len(pending)
-                while free > 0 and (block := next(blocks, None)) is not None:
-                    pending[self.client.submit(task, block, pure=False)] = block
-                    free -= 1
-                if not pending:
-                    return
-                with suppress(TimeoutError):
-                    wait(
-                        [*pending], CLUSTER_POLL_SECONDS, return_when="FIRST_COMPLETED"
-                    )
-                for future in [each for each in pending if each.done()]:
-                    block = pending.pop(future)
-                    try:
-                        outcomes, *there = future.result()
-                    except KilledWorker:
-                        case = block.turns[0][0].case
-                        reason = f"{case} was given up: its Dask workers were lost"
-                        outcomes = [BuildFailure(block=block, reason=reason)]
-                    else:
-                        self.add_node(*there)
-                    yield from outcomes
-        except Exception as e:
-            if isinstance(e, InputError) or self.client.status == "running":
-                raise
-            raise InputError(
-                f"the Dask scheduler at {self.address} is gone; start a scheduler at "
-                "this address, and repeat the command to continue"
-            ) from e
-        finally:
-            with suppress(Exception):  # the scheduler may be gone
-                self.client.cancel([*pending], force=True)
-
-    def _task(self, commands: Commands) -> Callable[[WorkUnit], Any]:
-        """Return the function that measures a block in a Dask worker."""
-        from mortarbench.harness.running.dask_worker import measure
-
-        return partial(
+        task = partial(
             measure,
-            run=self.client.id,
-            commands=commands,
-            plugins=tuple(file.resolved() for file in self.plugins),
-            operators=dict(self.operators),
-            packages=tuple(packages_of(self.environment)),
+            spread=address == LOCAL,
+            plugins=tuple(file.resolved() for file in plugins),
+            operators=dict(operators),
+            here=environment,
+        )
+        yield partial(_execute, client=client, task=task, keep=keep)
+
+
+def _execute(
+    blocks: Iterator[WorkUnit],
+    commands: Commands,
+    scratch: Path,
+    *,
+    client: Any,
+    task: Callable[..., Any],
+    keep: Callable[[str, Mapping[str, Any]], None],
+) -> Generator[Outcome]:
+    """Execute all blocks, and yield the outcomes of a block when it is complete.
+
+    Raises
+    ------
+    InputError
+        If a node is unsuitable, or if the scheduler or all workers are lost.
+
+    """
+    from distributed import KilledWorker, wait
+
+    pending: dict[Any, WorkUnit] = {}  # submitted blocks by future
+    try:
+        while True:
+            client.wait_for_workers(1, LOST_SECONDS)
+            free = max(0, len(client.nthreads()) - len(pending))
+            for block in islice(blocks, free):
+                pending[client.submit(task, block, commands, pure=False)] = block
+            if not pending:
+                return
+            with suppress(TimeoutError):
+                wait([*pending], CLUSTER_POLL_SECONDS, return_when="FIRST_COMPLETED")
+            for future in [each for each in pending if each.done()]:
+                block = pending.pop(future)
+                try:
+                    outcomes, environment = future.result()
+                    keep(digest(environment), environment)
+                except KilledWorker:
+                    reason = (
+                        f"{block.cases[0]} was given up: its Dask workers were lost"
+                    )
+                    outcomes = [BuildFailure(block=block, reason=reason)]
+                yield from outcomes
+    except (OSError, CancelledError) as e:  # also for a TimeoutError
+        raise InputError(
+            f"the Dask scheduler or all its workers are gone ({described(e)}); start "
+            "them again, and repeat the command to continue"
+        ) from e
+    finally:
+        with suppress(Exception):  # the scheduler may be gone
+            client.cancel([*pending], force=True)
+
+
+def measure(
+    block: WorkUnit,
+    commands: Commands,
+    *,
+    spread: bool,
+    plugins: tuple[PluginFile, ...],
+    operators: Mapping[str, Maker],
+    here: Mapping[str, Any],
+) -> tuple[list[Outcome], dict[str, Any]]:
+    """Measure a block in a Dask worker; stop early if the run has ended.
+
+    spread : True if the workers are numbered, on one machine; the number of a worker
+        then selects its CPU
+    operators : makers of operators P, except those of the plug-ins
+    here : environment of the parent
+
+    Returns
+    -------
+    outcomes and environment of this machine
+
+    Raises
+    ------
+    InputError
+        If this machine runs different code, or its disk is full.
+
+    """
+    from distributed import get_worker
+
+    worker, node = get_worker(), platform.node()
+    environment = _environment(digest(here), plugins, tuple(packages_of(here)))
+    refuse_other_code(node, here, environment)
+    for file in plugins:
+        operators = merged("operator", operators, load_plugin(file).operators)
+    changes = {"environment": digest(environment), "node": node}
+    turns = [tuple(r.replace(**changes) for r in turn) for turn in block.turns]
+    if spread:
+        cpus = fastest_first(os.sched_getaffinity(os.getpid()))
+        os.sched_setaffinity(0, {cpus[worker.name]})  # binds only this thread
+    task = worker.state.tasks[worker.get_current_task()]
+    outcomes: list[Outcome] = []
+    # the disk of this machine may be full
+    with _TURN, located(node), scratch_folder() as scratch:
+        units = iter([replace(block, turns=tuple(turns))])
+        with closing(execute(units, commands, scratch, operators=operators)) as made:
+            for outcome in made:
+                outcomes.append(outcome)
+                if task.state != "executing":
+                    break
+    return outcomes, environment
+
+
+def refuse_other_code(
+    node: str, here: Mapping[str, Any], there: Mapping[str, Any]
+) -> None:
+    """Raise InputError if a node runs other code than the parent.
+
+    here, there : environments of the parent and of the node
+    """
+    code = [d for d in differences(here, there) if d[0].startswith(_CODE)]
+    if code:
+        raise InputError(
+            f"{node} runs different code from this machine "
+            f"({in_words(code, 'here', 'there')}); install the same code on every node"
         )
 
-    def _await_workers(self, seconds: float | None) -> None:
-        """Wait until the cluster has a worker.
 
-        Raises
-        ------
-        InputError
-            If there is no worker after `seconds`.
-
-        """
-        if self.client.nthreads():
-            return
-        if self.address != LOCAL:
-            self.warn(f"waiting for Dask workers to join {self.address}")
-        try:
-            self.client.wait_for_workers(1, seconds)
-        except TimeoutError:
-            raise InputError(
-                f"all Dask workers of {self.address} were lost; start workers, and "
-                "repeat the command to continue"
-            ) from None
-
-    def add_node(self, node: str, environment: Mapping[str, Any]) -> None:
-        """Store the environment of a node if it is new.
-
-        Raises
-        ------
-        InputError
-            If the node runs a different version of the code.
-
-        """
-        name = digest(environment)
-        if name in self._stored:
-            return
-        changed = differences(self.environment, environment)
-        if code := [each for each in changed if each[0].startswith(_CODE)]:
-            raise InputError(
-                f"{node} runs different code from this machine "
-                f"({in_words(code, 'here', 'there')}); install the same code on every "
-                "node"
-            )
-        self._stored.add(name)
-        self.keep(name, environment)
+@lru_cache(maxsize=1)
+def _environment(
+    here: str, plugins: tuple[PluginFile, ...], packages: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return the environment of this node, captured once for each parent's."""
+    return capture_in_worker(plugins, packages)

@@ -54,7 +54,7 @@ OURS = (
 #: modules loaded for ``python -P -m dask``, the processes of a cluster
 CLUSTER = (
     *PLUGINS, "dask.__main__", "distributed.cli.dask_scheduler",
-    "distributed.cli.dask_worker", "mortarbench.harness.running.dask_worker",
+    "distributed.cli.dask_worker", "mortarbench.harness.running.cluster",
 )  # fmt: skip
 
 #: code that makes another program, such as a notebook kernel, start workers as forks
