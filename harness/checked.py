@@ -87,13 +87,10 @@ def filled_list(where: str, value: object) -> list[Any]:
     return entries
 
 
-def table(where: str, value: object, *, instead: str = "a table") -> dict[str, Any]:
-    """Check that `value` is a table (dict), and return it.
-
-    instead : description of the expected value in the error message
-    """
+def table(where: str, value: object) -> dict[str, Any]:
+    """Check that `value` is a table (dict), and return it."""
     if not isinstance(value, dict):
-        raise InputError(f"{where} = {shown(value)}; expected {instead}")
+        raise InputError(f"{where} = {shown(value)}; expected a table")
     return value
 
 

@@ -15,7 +15,7 @@ from mortarbench.problems.files.file_digest import check_digest, format_of
 
 @dataclass(frozen=True, kw_only=True)
 class FromFile(Family):
-    """QPs from files: npz, mat, QPS, Parquet, or JSON of Clarabel.
+    """QPs from files: npz, mat, QPS or Parquet.
 
     ``file:PATH.parquet#ROW`` is one problem of a Parquet file, counted from 1. Text and
     mat files may be compressed: ``file:PATH.qps.gz``. The digest of the file is a key

@@ -1,7 +1,7 @@
 """Formats and digests of QP files.
 
 Text and .mat files may be compressed by gzip; npz and Parquet have their own
-compression, and JSON is read uncompressed.
+compression.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from mortarbench.harness import InputError, Value
 from mortarbench.harness.errors import unknown
 
 COMPRESSIBLE = (".qps", ".mps", ".sif", ".mat")
-FORMATS = (".npz", ".parquet", ".json", *COMPRESSIBLE)  #: suffixes of QP files
+FORMATS = (".npz", ".parquet", *COMPRESSIBLE)  #: suffixes of QP files
 
 
 def format_of(path: Path) -> str:

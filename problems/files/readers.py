@@ -23,8 +23,6 @@ from mortarbench.harness.files.qpfile import (
     qp_of,
     stored_matrix,
 )
-from mortarbench.harness.files.reading import read_json
-from mortarbench.problems.files.clarabel_json import clarabel_qp
 from mortarbench.problems.files.file_digest import format_of
 from mortarbench.problems.files.qps import parse_qps
 from mortarbench.problems.files.two_sided import LoadedQP, TwoSidedQP, loaded
@@ -85,12 +83,6 @@ def _text(path: Path, expected: str, parse: Callable[[str], TwoSidedQP]) -> Load
         return loaded(parse(text))
 
 
-def _json(path: Path) -> LoadedQP:
-    data = read_json(path, "a problem of Clarabel")
-    with located(str(path)):
-        return LoadedQP(clarabel_qp(data))
-
-
 _qps = partial(_text, expected="a QPS file", parse=parse_qps)
 _READERS: dict[str, Callable[[Path], LoadedQP]] = {
     ".npz": _npz,
@@ -98,7 +90,6 @@ _READERS: dict[str, Callable[[Path], LoadedQP]] = {
     ".qps": _qps,
     ".mps": _qps,
     ".sif": _qps,
-    ".json": _json,
 }
 
 

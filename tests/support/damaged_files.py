@@ -57,13 +57,6 @@ ENDATA
 """
 
 
-CLARABEL = b"""{"P": {"m": 2, "n": 2, "colptr": [0, 1, 3], "rowval": [0, 0, 1],
-"nzval": [2.0, -0.5, 2.0]}, "q": [1.0, -1.0], "A": {"m": 3, "n": 2,
-"colptr": [0, 2, 4], "rowval": [0, 1, 0, 2], "nzval": [1.0, -1.0, 2.0, -1.0]},
-"b": [1.0, 0.0, 1e20], "cones": [{"ZeroConeT": 1}, {"NonnegativeConeT": 2}]}
-"""
-
-
 class Touch:
     """Object that creates a file when it is unpickled."""
 
@@ -127,7 +120,7 @@ def seeds(folder):
     for more in (none, hostile):
         plain = {"P": np.eye(2), "q": np.ones(2), **more}
         written("npz", lambda path, a=plain: np.savez(path, **a))
-    found |= {"qps": [QPS], "json": [CLARABEL], "hdf5": []}
+    found |= {"qps": [QPS], "hdf5": []}
     written("hdf5", lambda path: write_boxes(path, 1))
     one = local_arrays(np.eye(3), np.ones(3), np.ones(1))
     written("hdf5", lambda path: write_datasets(path, one))

@@ -406,7 +406,7 @@ def test_a_hostile_qps_text_is_refused_with_its_line(tmp_path, old, new, message
 
 # random damage; of meshes, in problems/fem/test_damaged_meshes.py
 
-KINDS = ("npz", "mat", "parquet", "qps", "json", "hdf5")
+KINDS = ("npz", "mat", "parquet", "qps", "hdf5")
 
 
 @pytest.mark.parametrize("kind", KINDS)
