@@ -79,7 +79,6 @@ def measure_and_write(
         registries.environment(),
         say,
         baseline=_answer(registries, "smalbe-paper"),
-        reference=registries.reference,
     )
     for name, narrowed in BEYOND.items():
         say(f"Suite {name}")

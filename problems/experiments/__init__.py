@@ -1,4 +1,4 @@
-"""Experiments that reproduce the figures and tables of the paper, and further ones."""
+"""Experiments that reproduce the figures and tables of the paper."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from mortarbench.problems.experiments.parts import (
     counts,
     inverse,
 )
-from mortarbench.problems.experiments.physics import pressures, stepping, verification
 from mortarbench.problems.experiments.plan import PAPER, QUICK, Plan
 from mortarbench.problems.families.beam_ring import BEAM, LOAD, RING
 
@@ -30,7 +29,6 @@ def paper_experiment(
     say: Callable[[str], None],
     *,
     baseline: Reference,
-    reference: Reference,
 ) -> Experiment:
     """Run all experiments; the caller sets the number of threads.
 
@@ -38,7 +36,6 @@ def paper_experiment(
     ----------
     solve : solver of this project for the dual QPs, timed
     baseline : solver of the paper for the dual QPs, timed
-    reference : solver for the experiments on accuracy, not timed
     environment : description of the environment, stored with the measurements
     say : callback that receives one line before each experiment
 
@@ -50,10 +47,6 @@ def paper_experiment(
         ("figure5", "Figure 5: generalised inverse", lambda: inverse(plan)),
         ("figure6", "Figure 6: the whole analysis",
          lambda: scaling(plan, solve, baseline)),
-        ("stepping", "Accuracy of the stepping", lambda: stepping(plan, reference)),
-        ("pressures", "Contact pressures", lambda: pressures(plan, reference)),
-        ("verification", "Contact rows against exact solutions",
-         lambda: verification(plan, reference)),
     )  # fmt: skip
     for name, title, rows in experiments:
         say(title)

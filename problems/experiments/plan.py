@@ -25,13 +25,6 @@ class Plan:
     Nh: int = 15  #: value of Nh in Figures 6, 7 and Table 1
     example: tuple[int, int] = (4, 3)  #: values of Nr and Nh in Figure 2
     steps: int = 10  #: number of load steps
-    stepped: tuple[int, int]  #: values of Nr and Nh in the study of load stepping
-    stepping: tuple[int, ...]  #: numbers of load steps in this study
-    #: numbers of linearisations per step in this study
-    relin: tuple[int, ...] = (1, 2, 3)
-    #: numbers of elements along the upper block of the patch test
-    patch: tuple[int, ...]
-    hertz: tuple[int, ...]  #: numbers of elements per half width of Hertz's contact
 
 
 PAPER = Plan(
@@ -44,8 +37,6 @@ PAPER = Plan(
     dense=2000,
     scaling=(2, 5, 10, 15, 20, 25, 30),
     scaling_rounds=Rounds(most=10, least=6, seconds=60),
-    stepped=(20, 10), stepping=(1, 2, 5, 10, 20, 40, 80),
-    patch=(2, 4, 8, 16, 32), hertz=(3, 6, 12, 24, 48),
 )  # fmt: skip
 
 QUICK = Plan(
@@ -58,6 +49,4 @@ QUICK = Plan(
     dense=800,
     scaling=(5, 15, 30),
     scaling_rounds=Rounds(most=6, least=2, seconds=2),
-    stepped=(10, 5), stepping=(1, 2, 5, 10, 20, 40),
-    patch=(2, 4, 8, 16), hertz=(3, 6, 12, 24),
 )  # fmt: skip

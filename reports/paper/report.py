@@ -15,7 +15,6 @@ from mortarbench.harness.files.durable import replace_file
 from mortarbench.harness.results.experiment import Experiment
 from mortarbench.reports.document import (
     Document,
-    Item,
     Picture,
     Section,
     clean,
@@ -24,7 +23,7 @@ from mortarbench.reports.document import (
 )
 from mortarbench.reports.figures.deformed import PERCENTILE
 from mortarbench.reports.measurements import Measurements, read_measurements
-from mortarbench.reports.paper import bodies, physics, published
+from mortarbench.reports.paper import bodies, published
 from mortarbench.reports.paper import timings as timed
 from mortarbench.reports.paper.fleet import certified, fleet
 from mortarbench.reports.writing import write_document
@@ -90,21 +89,16 @@ def compose(
         "figure6": partial(timed.scaling_figure, rows),
         "figure7": partial(bodies.stress_figure, states["largest"]),
         "zoom": partial(bodies.zoom_figure, states["largest"]),
-        "pressure": partial(physics.pressure_figure, tables["pressures"]),
-        "verification": partial(physics.verification_figure, tables["verification"]),
-        "stepping": partial(physics.stepping_figure, tables["stepping"]),
     }
     results = (
         timed.table_1(tables["table1"]), timed.timings(largest, plan["steps"], machine)
     )  # fmt: skip
-    orders = physics.orders(tables["stepping"])
-    tables_of: dict[str, tuple[Item, ...]] = {"figure7": results, "stepping": (orders,)}
     numbers = facts(experiment, tables)
     sections = [_summary(largest)]
     for name, text in _TEXTS.items():
         caption = text["caption"].format(**numbers)
         picture = Picture(name=name, caption=caption, draw=draw[name])
-        items = (*tables_of.get(name, ()), picture)
+        items = (*results, picture) if name == "figure7" else (picture,)
         sections.append(Section(name=name, title=text["title"], items=items))
     solvers = tuple(dict.fromkeys(s for of in suites.values() for s in of.solvers))
     for name, of in BEYOND.items():
@@ -128,9 +122,6 @@ def facts(experiment: Experiment, tables: Mapping[str, pd.DataFrame]) -> dict[st
         for letter, name in zip("abcd", bodies.STRESSES, strict=True)
         for clipped, largest in [bodies.extent(states["largest"], name)]
     )
-    steps = physics.active(tables["pressures"], "nts").step
-    patch = tables["verification"].query("problem == 'patch'").sort_values("n")
-    errors = patch.groupby("contact").error
     return {
         **plan,
         "Nr": max(plan["scaling"]),
@@ -143,11 +134,6 @@ def facts(experiment: Experiment, tables: Mapping[str, pd.DataFrame]) -> dict[st
         "dense": tables["figure5"].query("method == 'pinv'").n.max(),
         "percentile": PERCENTILE,
         "ends": ", ".join(ends),
-        "first_active": (steps == 1).sum(),
-        "last_active": (steps == plan["steps"]).sum(),
-        "patch_nts": 100 * errors.last()["nts"],
-        "patch_mortar": errors.max()["mortar"],
-        "settled": tables["stepping"].iloc[-1],
     }
 
 
