@@ -54,7 +54,6 @@ from mortarbench.problems.keys import (
     Bound,
     ContactStiffness,
     Glue,
-    Halvings,
     Kinematics,
     Law,
     Loading,
@@ -109,7 +108,6 @@ class MeshedBodies(ContactFamily):
     newton: Newton = 0
     parts: Annotated[int, Range(0), "number of subdomains; 0: undivided bodies"] = 0
     glue: Glue = "orthonormal"
-    halvings: Halvings = 0
 
     def __post_init__(self) -> None:
         """Read settings from the TOML file; check all keys and the digest."""
@@ -143,7 +141,7 @@ class MeshedBodies(ContactFamily):
 
     def bodies(self) -> UnassembledBodies:
         """Return the bodies; in 3D, no key may have a value for plane bodies."""
-        bodies = _bodies(self.path, self.sha256, self.plane, self.halvings)
+        bodies = _bodies(self.path, self.sha256, self.plane)
         if bodies.mesh.dim > 2:
             check_plane_only(self, "volumes")
         return bodies
@@ -371,7 +369,7 @@ def _fold(mesh: Mesh, faces: Nodes) -> Nodes | None:
 
 
 @lru_cache(maxsize=4)
-def _bodies(path: str, sha256: str, plane: Any, halvings: int) -> UnassembledBodies:
+def _bodies(path: str, sha256: str, plane: Any) -> UnassembledBodies:
     """Return the bodies of a TOML file; `sha256` only distinguishes cached results."""
     del sha256
-    return read_bodies(Path(path), plane, halvings)
+    return read_bodies(Path(path), plane)

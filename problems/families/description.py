@@ -121,7 +121,6 @@ from mortarbench.problems.fem.mesh_files.named import (
     NamedMesh,
     named_mesh,
     oriented,
-    refine,
 )
 from mortarbench.problems.fem.mesh_files.reading import read_mesh_file
 from mortarbench.problems.keys import (
@@ -217,10 +216,8 @@ def read_description(path: Path) -> dict[str, Any]:
     return table
 
 
-def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
+def read_bodies(path: Path, plane: Any) -> UnassembledBodies:
     """Read the bodies of a TOML file and its mesh.
-
-    halvings : number of uniform refinements of the mesh, with straight edges
 
     Raises
     ------
@@ -230,21 +227,12 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
 
     """
     table = read_description(path)
-    mesh_path = path.parent / table["mesh"]
-    file = read_mesh_file(mesh_path)
+    file = read_mesh_file(path.parent / table["mesh"])
     with located(str(path)):
         described = _described(table["bodies"], file)
     named = named_mesh(file, {file.set_of(name) for name in described})
-    if named.dim == 3 and halvings:
-        raise InputError(
-            f"{mesh_path}: halvings={halvings} with volumes is not built; expected "
-            "halvings=0, and a finer mesh file"
-        )
-    refined = 2 * len(named.cells) * 4**halvings  # checked before refining
     with located(str(path)):
-        check_memory(refined if named.dim == 2 else named.points.size)
-    for _ in range(halvings):
-        named = refine(named)
+        check_memory(named.points.size)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
     body = np.repeat(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -230,7 +230,11 @@ def named_mesh(file: FileMesh, chosen: Collection[str] = ()) -> NamedMesh:
         dim,
         {k: len(v) for k, v in sets.items()},
     )
-    used = _node_order(cells, list(surfaces.values()), piece)
+    # piece by piece, and ascending within a body
+    bodies = list(surfaces.values())
+    order = np.argsort(piece, kind="stable")
+    nodes = np.concatenate([np.unique(cells[bodies[b]]) for b in order])
+    used = nodes[np.sort(np.unique(nodes, return_index=True)[1])]
     renumbered = np.full(len(points), -1)
     renumbered[used] = np.arange(used.size)
     points = points[used, :dim]
@@ -268,66 +272,6 @@ def named_mesh(file: FileMesh, chosen: Collection[str] = ()) -> NamedMesh:
         | {name: np.unique(nodes) for name, nodes in spots.items()},
         piece=piece,
         words=words,
-    )
-
-
-def refine(mesh: NamedMesh) -> NamedMesh:
-    """Refine a plane mesh: bisect every edge, and divide each cell into four.
-
-    The shape of bodies is unchanged, because new nodes on edges are midpoints. A
-    triangle is divided into four similar triangles, and a quadrilateral into four
-    quadrilaterals that meet at the mean of its corners. Nodes remain numbered body by
-    body.
-    """
-    cells, corners = mesh.cells, mesh.cells.T
-    is_quad = ~is_triangle(cells)
-    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1)  # (E, 4, 2)
-    ends, middle = np.unique(
-        np.sort(edges.reshape(-1, 2), axis=1), axis=0, return_inverse=True
-    )
-    n = len(mesh.points)
-    # the midpoint of the degenerate edge of a triangle is its repeated corner
-    is_edge = ends[:, 0] != ends[:, 1]
-    number = np.where(is_edge, n + np.cumsum(is_edge) - 1, ends[:, 0])
-    m = number[middle].reshape(-1, 4).T
-    centre = n + is_edge.sum() + np.cumsum(is_quad) - 1
-    points = np.concatenate(
-        [
-            mesh.points,
-            mesh.points[ends[is_edge]].mean(axis=1),
-            mesh.points[cells[is_quad]].mean(axis=1),
-        ]
-    )
-    children = np.stack(
-        [
-            np.stack([corners[k], m[k], np.where(is_quad, centre, m[k - 1]), m[k - 1]])
-            for k in range(4)
-        ],
-        axis=-1,
-    )
-    # a triangle repeats its third corner: one of the two children at this corner is
-    # replaced by the triangle of the midpoints
-    children[:, ~is_quad, 2] = np.stack([corners[2], m[3], m[1], m[1]])[:, ~is_quad]
-    children[:, ~is_quad, 3] = m[[0, 1, 3, 3]][:, ~is_quad]
-    fine = np.ascontiguousarray(children.transpose(1, 2, 0))  # (E, 4 children, 4)
-    of_edge = {(a, b): k for (a, b), k in zip(ends.tolist(), number, strict=True)}
-    used = _node_order(fine, list(mesh.surfaces.values()), mesh.piece)
-    renumbered = np.empty(len(points), dtype=np.int64)
-    renumbered[used] = np.arange(used.size)
-
-    def cut(curve: Nodes) -> Nodes:
-        a, b = curve.T
-        at = np.array([of_edge[min(e), max(e)] for e in curve.tolist()], dtype=np.int64)
-        return np.asarray(renumbered[np.stack([a, at, at, b], axis=-1).reshape(-1, 2)])
-
-    return NamedMesh(
-        points[used],
-        renumbered[fine.reshape(-1, 4)],
-        {k: (4 * v[:, None] + np.arange(4)).ravel() for k, v in mesh.surfaces.items()},
-        {name: cut(curve) for name, curve in mesh.curves.items()},
-        {name: renumbered[spot] for name, spot in mesh.spots.items()},
-        mesh.piece,
-        mesh.words,
     )
 
 
@@ -457,16 +401,6 @@ def _remedy(kind: str, words: Words) -> str:
     if any(kind.startswith(known) for known in DIMENSION):
         return f"expected cells of first order: {words.linear}"
     return f"expected {', '.join(DIMENSION)}, as meshio calls them"
-
-
-def _node_order(cells: Nodes, bodies: Sequence[Nodes], piece: Nodes) -> Nodes:
-    """Return the nodes of all bodies, piece by piece and ascending within a body.
-
-    bodies : numbers of the cells of each body
-    """
-    order = np.argsort(piece, kind="stable")
-    nodes = np.concatenate([np.unique(cells[bodies[b]]) for b in order])
-    return nodes[np.sort(np.unique(nodes, return_index=True)[1])]
 
 
 def oriented(path: Path | str, points: NDArray[np.float64], cells: Nodes) -> Nodes:

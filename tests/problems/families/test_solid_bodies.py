@@ -115,7 +115,6 @@ def test_loads_on_faces_are_spread_by_area(tmp_path):
     [
         ("", "", "/kinematics=finite", "kinematics=finite with volumes is not built"),
         ("", "", "/plane=stress", "plane=stress with volumes is not built; expected"),
-        ("", "", "/halvings=1", "halvings=1 with volumes is not built; expected halvi"),
         ('name = "lower"', 'name = "lowr"', "",
          "bodies[0]: name: unknown physical volume 'lowr'; did you mean 'lower'?"),
         ('boundary = "base"', 'boundary = "bass"', "",

@@ -1,4 +1,4 @@
-"""Plane meshes: areas, boundaries, joined bodies and refinement."""
+"""Plane meshes: areas, boundaries and joined bodies."""
 
 from dataclasses import replace
 
@@ -14,9 +14,6 @@ from mortarbench.problems.fem.mesh import (
     prefixed,
     rectangle,
 )
-from mortarbench.problems.fem.mesh_files.named import refine
-from mortarbench.problems.fem.mesh_files.reading import read_msh
-from tests.support import ROOT
 
 
 def signed_areas(mesh):
@@ -126,59 +123,3 @@ def test_bodies_whose_nodes_are_not_numbered_body_by_body_are_refused():
 
     with pytest.raises(ValueError, match="in the order of their bodies"):
         replace(bodies, shape=replace(bodies.shape, mesh=mesh))
-
-
-@pytest.fixture(params=["tests/data/press.msh", "suites/crossval/punch.msh"])
-def named(request):
-    """Return a mesh of several bodies with named sides, of triangles or
-    quadrilaterals.
-    """
-    return read_msh(ROOT / request.param)
-
-
-def test_halved_cells_fill_each_body_and_meet_at_whole_edges(named):
-    fine = refine(named)
-
-    assert signed_areas(fine).min() > 0
-    for name, cells in named.surfaces.items():
-        before, after = (
-            signed_areas(m)[c].sum()
-            for m, c in ((named, cells), (fine, fine.surfaces[name]))
-        )
-        assert after == pytest.approx(before, rel=1e-13)
-        assert len(fine.surfaces[name]) == 4 * len(cells)
-    # Euler's characteristic is preserved; a hanging node would change it
-    before, after = (len(m.points) - edges(m) + len(m.cells) for m in (named, fine))
-    assert after == before
-
-
-def edges(mesh):
-    pairs = np.stack([mesh.cells, np.roll(mesh.cells, -1, axis=1)], axis=-1)
-    pairs = pairs.reshape(-1, 2)
-    return len(np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]]), axis=0))
-
-
-def test_halved_sides_are_the_same_polygons_with_the_body_on_their_left(named):
-    fine = refine(named)
-
-    for name, side in named.curves.items():
-        ends, halves = named.points[side], fine.points[fine.curves[name]]
-        middle = ends.mean(axis=1)
-        assert np.array_equal(halves[::2], np.stack([ends[:, 0], middle], axis=1))
-        assert np.array_equal(halves[1::2], np.stack([middle, ends[:, 1]], axis=1))
-    for name, spot in named.spots.items():
-        assert np.array_equal(fine.points[fine.spots[name]], named.points[spot])
-
-
-def test_triangles_are_halved_into_similar_ones(named):
-    """The ratios between the sides are preserved, so that no angle degenerates."""
-
-    def shapes(mesh):
-        cells = mesh.cells[mesh.cells[:, 2] == mesh.cells[:, 3]][:, :3]
-        x = mesh.points[cells]
-        sides = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=-1)
-        return np.sort(sides / sides.max(axis=1, keepdims=True), axis=1)
-
-    before, after = shapes(named), shapes(refine(named))
-    assert np.allclose(np.sort(np.repeat(before, 4, axis=0), axis=0),
-                       np.sort(after, axis=0), atol=1e-12)  # fmt: skip
