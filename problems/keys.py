@@ -227,17 +227,9 @@ def check_plane_only(family: Any, space: str) -> None:
             )
 
 
-def check_tangential(family: Any) -> None:
-    """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak.
-
-    Q is the final tangential force and `peak` is the largest one before unloading, both
-    relative to the limit of friction, μP.
-    """
-    Q, peak = family.Q, family.peak
-    if not 0 < peak < 1:
+def check_tangential(Q: float) -> None:
+    """Raise InputError unless 0 < Q < 1, a tangential force in units of its limit."""
+    if not 0 < Q < 1:
         raise InputError(
-            f"{'Q' if peak == Q else 'peak'}={peak} must be between 0 and 1, a "
-            "fraction of μP"
+            f"Q={Q} must be between 0 and 1, a fraction of the limit of friction"
         )
-    if abs(Q) > peak:
-        raise InputError(f"Q={Q} must be between -peak and peak={peak}")

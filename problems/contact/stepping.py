@@ -109,6 +109,34 @@ def load_steps(
     )
 
 
+def normal_first(
+    normal: Vector,
+    both: Vector,
+    fixed: Nodes,
+    symmetric: Nodes,
+    law: FrictionLaw,
+    begin: Callable[[State], State] = restart_slip,
+) -> tuple[Stage, Stage]:
+    """Return the stages of a tangential force that acts after the normal force.
+
+    The first stage has no friction, and further supports, without which the bodies
+    could slide or roll.
+
+    Parameters
+    ----------
+    normal, both : (n,) loads of the two stages, nondimensional
+    symmetric : components that are fixed in the first stage only, without reactions
+    law : friction law of the single pair in the second stage
+    begin : initial state of the second stage; by default, slip is measured from the end
+        of the first stage
+
+    """
+    return (
+        Stage(step=1, part=1.0, load=normal, fixed=np.append(fixed, symmetric)),
+        Stage(step=1, part=1.0, load=both, fixed=fixed, laws=(law,), begin=begin),
+    )
+
+
 class LinearisedProblem(Protocol):
     """A linearised contact problem; its dual can be solved for any friction bounds."""
 

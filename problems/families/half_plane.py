@@ -16,9 +16,8 @@ form ``dual`` of bodies with one rigid motion.
 
 * law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, Σλ = P, with the gap g = x²/2R. The elements
   cover |x| ≤ 3a/2
-* law=cattaneo: min ½λᵀFλ − (Fλ*)ᵀλ over |λ_i| ≤ μ∫p over element i, Σλ = Q, with the
-  exact pressure p. In unloading, λ* are the exact tangential forces at the peak;
-  otherwise λ* = 0. The elements cover |x| ≤ a
+* law=cattaneo: min ½λᵀFλ over |λ_i| ≤ μ∫p over element i, Σλ = Q, with the exact
+  pressure p. The elements cover |x| ≤ a
 
 Forces are in units of F₀, which is P for normal and μP for tangential forces, and
 displacements in units of l = 2F₀/(πE*). Then F is a matrix of logarithms, and Hertz's
@@ -44,13 +43,12 @@ from mortarbench.harness import (
     ContactSide,
     Family,
     Fields,
-    InputError,
     Matrix,
     Reference,
     Solution,
     Vector,
 )
-from mortarbench.harness.keys import DERIVED, Range
+from mortarbench.harness.keys import Range
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.families.half_space.cases import (
     relative_distance,
@@ -63,7 +61,7 @@ from mortarbench.problems.families.hertz import (
     UNIT_LOAD,
 )
 from mortarbench.problems.families.line_contact import LineContact, TangentialContact
-from mortarbench.problems.keys import check_fits, check_tangential
+from mortarbench.problems.keys import check_fits, check_tangential, refuse_unused
 
 MU = 0.3
 LOAD = 10 * UNIT_LOAD  #: normal force P, N/m
@@ -86,29 +84,22 @@ class HalfPlane(Family):
         "hertz"
     )
     Q: Annotated[float, "tangential force, a fraction of μP"] = 0.0
-    peak: Annotated[float, "force before unloading, a fraction of μP; default: Q"] = (
-        DERIVED
-    )
 
     def __post_init__(self) -> None:
-        """Derive `peak`; check that the law admits Q and peak, and the size."""
-        self.derive(peak=self.Q)
+        """Check that the law admits Q, and the size."""
         super().__post_init__()
         needed = 8 * self.n**2 / 2**20
         check_fits(f"a full matrix of {self.n} rows takes", needed, "a matrix")
         if self.law == "cattaneo":
-            check_tangential(self)
-        elif key := next((key for key in ("Q", "peak") if getattr(self, key)), ""):
-            raise InputError(
-                f"{key}={getattr(self, key)} needs law=cattaneo; law=hertz has no "
-                "tangential force"
-            )
+            check_tangential(self.Q)
+        else:
+            refuse_unused(self, "Q", "law=hertz", "law=cattaneo")
 
     def build(self, form: str, reference: Reference) -> Case:
         """Return the case, in form dual."""
         if self.law == "hertz":
             return _hertz_case(self.n)
-        return _cattaneo_case(self.n, TangentialContact(EXACT, MU, self.Q, self.peak))
+        return _cattaneo_case(self.n, TangentialContact(EXACT, MU, self.Q))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,23 +193,20 @@ def _hertz_case(n: int) -> Case:
 
 def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
     elements = Elements(n, 1.0)
-    F0, ends = exact.mu * EXACT.P, EXACT.a * elements.ends
-    bound = np.diff(EXACT.force(ends)) / EXACT.P
-    unloads = exact.Q != exact.peak
-    at_peak = np.diff(exact.before.force(ends)) / F0 if unloads else np.zeros(n)
+    F0 = exact.mu * EXACT.P
+    bound = np.diff(EXACT.force(EXACT.a * elements.ends)) / EXACT.P
     F = elements.F
-    qp = _dual(F, -F @ at_peak, exact.Q, -bound, bound)
+    qp = _dual(F, np.zeros(n), exact.Q, -bound, bound)
     x, width = EXACT.a * elements.middle, EXACT.a * elements.h
     exact_displacement = displacement(exact.semicircles)
-    displacement_at_peak = displacement(exact.before.semicircles) if unloads else 0.0
     exact_energy = self_energy(exact.semicircles) - exact.Q * exact_displacement
 
     def quantities(s: Solution) -> dict[str, Any]:
         """Compare with Cattaneo and Mindlin's solution.
 
         Errors are relative; the error of q is in the l² norm. `energy` is the elastic
-        energy minus Q·displacement in J/m; `dissipation` is Σg|slip| of this loading or
-        unloading in J/m, with the friction bounds g; `stick_half_width` is the half
+        energy minus Q·displacement in J/m; `dissipation` is Σg|slip| in J/m, with
+        the friction bounds g; `stick_half_width` is the half
         width of the stick zone for which the exact traction has the same ∫x²q;
         `shear_centre` is the mean of q over the one or two elements next to x = 0.
         """
@@ -229,7 +217,7 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
         central = slice((n - 1) // 2, n // 2 + 1)  # one element, or two for even n
         centre, at_centre = (float(v[central].mean()) for v in (q, mindlin))
         slips = slipping(s)
-        energy = 0.5 * s.x @ (F @ s.x) - exact.Q * (displacement_at_peak - s.y[0])
+        energy = 0.5 * s.x @ (F @ s.x) + exact.Q * s.y[0]
         return {
             "elements": n,
             "contact_rows": n,
@@ -240,7 +228,7 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
             "energy_error": float(energy / exact_energy - 1),
             "dissipation": float(bound @ np.abs(s.z_box)) * _energy_unit(F0),
             "tangential_force": float(force.sum()),
-            "force_error": float((s.x.sum() - exact.Q) / exact.peak),
+            "force_error": float(s.x.sum() / exact.Q - 1),
             "shear_centre": centre,
             "shear_centre_error": centre / at_centre - 1,
             "shear_l2_error": relative_distance(q, mindlin),

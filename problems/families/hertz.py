@@ -23,14 +23,7 @@ loads are shear tractions with resultants ±Q, and normal tractions, linear alon
 side, that balance the moment without supports. Loads and deformations of the two bodies
 are symmetric: contact and friction alone support the upper body, and the supports of
 the lower body have no reactions. Exact tractions are those of
-`problems.families.line_contact`. The key `programme` is
-
-* normal-first: P without friction, then the peak of Q, then the reduced Q, in one stage
-  each;
-* proportional: P and Q grow together in steps k = 1, 2, … with friction, with P ∝ k² so
-  that a grows by equal increments. If slip is measured from the end of the preceding
-  step (quasi-static), the shear traction is (Q/P)p and nothing slips. For a single
-  static load, the tractions are as if Q had been applied last.
+`problems.families.line_contact`. P acts first, without friction, then Q with friction.
 
 Two errors do not vanish as the mesh is refined, because the bodies are finite (0.1 %)
 and a/R is not zero. Contact of two cylinders is linearised at the undeformed state,
@@ -43,7 +36,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -58,7 +50,7 @@ from mortarbench.harness import (
     Solution,
     Vector,
 )
-from mortarbench.harness.keys import DERIVED, Range
+from mortarbench.harness.keys import Range
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
@@ -68,7 +60,12 @@ from mortarbench.problems.contact.friction import law_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
 from mortarbench.problems.contact.rigid import RigidPlane
-from mortarbench.problems.contact.stepping import Stage, State, load_steps
+from mortarbench.problems.contact.stepping import (
+    continue_slip,
+    load_steps,
+    normal_first,
+    restart_slip,
+)
 from mortarbench.problems.duality.case_forms import with_exact_tractions
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_path
@@ -105,10 +102,8 @@ from mortarbench.problems.keys import (
     Mu,
     Newton,
     PlaneState,
-    Steps,
     check_memory,
     check_tangential,
-    refuse_unused,
 )
 
 RADIUS = 8e-3  #: radius R of a cylinder, m
@@ -201,74 +196,56 @@ class HertzCylinder(ContactFamily):
     mu: Mu = UNSET
     loading: Loading = "quasi-static"
     Q: Annotated[float, "tangential force, a fraction of μP"] = 0.0
-    peak: Annotated[float, "force before unloading, a fraction of μP; default: Q"] = (
-        DERIVED
-    )
-    programme: Annotated[
-        Literal["normal-first", "proportional"], "P before Q, or both together"
-    ] = "normal-first"
-    steps: Steps = 20
     feti: Feti = 0
     glue: Glue = "orthonormal"
 
     def __post_init__(self) -> None:
-        """Derive `peak`; check that every key has an effect."""
-        self.derive(peak=self.Q)
+        """Check that the mesh fits into memory, and that Q has an exact solution."""
         super().__post_init__()
         check_memory((self.n * 2**self.halvings) ** 2)
-        has_shear = bool(self.Q or self.peak)
-        proportional = self.programme == "proportional"
-        if has_shear:
+        if self.Q:
             for name, value in (("friction", "coulomb"), ("ratio", 1.0)):
                 if getattr(self, name) != value:
                     raise InputError(
                         f"{name}={getattr(self, name)} is not supported with a "
-                        f"tangential force; expected {name}={value}, or no Q and "
-                        "no peak"
+                        f"tangential force; expected {name}={value}, or no Q"
                     )
-            check_tangential(self)
+            check_tangential(self.Q)
             POSITIVE.require("mu", self.mu)
-        if self.loading == "static" and self.Q != self.peak:
-            raise InputError(
-                f"peak={self.peak} is not used by loading=static; expected "
-                "loading=quasi-static, which unloads"
-            )
-        if proportional and not (has_shear and self.Q == self.peak):
-            raise InputError(
-                "programme=proportional requires Q > 0 and peak=Q (the default), that "
-                "is, no unloading"
-            )
-        if not proportional:
-            programme = f"programme={self.programme}"
-            refuse_unused(self, "steps", programme, "programme=proportional")
 
     def problem(self) -> ContactProblem:
         """Return the problem of two cylinders, linearised at the undeformed state."""
         elastic, exact = two_cylinders(self)
-        laws, shear = (
-            (law_of(self.friction, self.bound, self.mu),),
-            _exact_shear(exact, self) if self.peak else None,
-        )
+        law = law_of(self.friction, self.bound, self.mu)
+        mindlin = TangentialContact(exact, self.mu, self.Q) if self.Q else None
 
         def results(answer: ContactSolution) -> dict[str, Any]:
             bodies, primal, s, _, friction = answer.sides
             values = pressure_quantities(bodies, primal, exact, s)
-            if shear is not None:
-                values |= shear_quantities(
-                    bodies, primal, exact, s, friction, self, shear
-                )
+            if mindlin is not None:
+                sign = 1.0 if self.slave == "upper" else -1.0
+                values |= shear_quantities(bodies, primal, mindlin, s, friction, sign)
             if self.friction == "coulomb":
                 values["tresca_problems"] = answer.problems
             return values
 
-        stages = load_steps(1, 1, elastic.f, elastic.fixed, laws)
-        has_exact = self.friction == "none" or shear is not None
+        stages = load_steps(1, 1, elastic.f, elastic.fixed, (law,))
+        if self.Q:
+            both = elastic.f + self.Q * self.mu * _shearing(elastic.mesh)
+            # without supports on the axis and without friction, the cylinders could
+            # roll on each other almost freely, because only the polygonal shape of the
+            # arcs would resist; under P, these supports have no reactions
+            axis = _on_axis(elastic.mesh.boundaries, "upper_")
+            begin = restart_slip if self.loading == "quasi-static" else continue_slip
+            stages = normal_first(elastic.f, both, elastic.fixed, axis, law, begin)
+        shear = np.zeros_like if mindlin is None else mindlin.traction
+        has_exact = self.friction == "none" or mindlin is not None
         return ContactProblem(
             bodies=elastic,
             linearise=keyed_linearisation(self.contact, self.basis, undeformed=True),
             results=results,
-            stages=stages if shear is None else _programme(self, elastic),
-            exact=_curve(exact, shear or np.zeros_like) if has_exact else None,
+            stages=stages,
+            exact=_curve(exact, shear) if has_exact else None,
         )
 
 
@@ -295,48 +272,6 @@ def _cylinder_on_plane(
     ), exact
 
 
-def _programme(keys: HertzCylinder, elastic: UnassembledBodies) -> tuple[Stage, ...]:
-    """Return the stages of a tangential load: P without friction, then P and Q.
-
-    In the first stage, supports on the axis fix the upper cylinder horizontally; under
-    P they have no reactions. Without these supports and without friction, the cylinders
-    could roll on each other almost freely, because only the polygonal shape of the arcs
-    would resist. Slip in the next stage would then be measured from an arbitrary state,
-    and the rolling would contribute to the work of Q.
-    """
-    mesh = elastic.mesh
-    pressing, shearing = elastic.f, _shearing(mesh)
-    loads = _loads(keys)
-    quasi_static = keys.loading == "quasi-static"
-
-    def begin(k: int, end: State) -> State:
-        """Return the initial state of a stage, with normal forces in proportion to P.
-
-        k : number of the stage with friction, from 0
-        end : state at the end of the preceding stage
-        """
-        previous = loads[max(k - 1, 0)][0]
-        # slip may be measured from rest instead of the state under P alone
-        at_rest = not k and (not quasi_static or keys.programme == "proportional")
-        u = np.zeros_like(end.u) if at_rest else end.u
-        slip = u if quasi_static else np.zeros_like(u)
-        return State(u, slip, loads[k][0] / previous * end.normal_forces)
-
-    fixed = np.append(elastic.fixed, _on_axis(mesh.boundaries, "upper_"))
-    first = Stage(step=1, part=1.0, load=loads[0][0] * pressing, fixed=fixed)
-    return first, *(
-        Stage(
-            step=1,
-            part=1.0,
-            load=P * pressing + Q * keys.mu * shearing,
-            fixed=elastic.fixed,
-            laws=(law_of(keys.friction, keys.bound, keys.mu),),
-            begin=partial(begin, k),
-        )
-        for k, (P, Q) in enumerate(loads)
-    )
-
-
 def two_cylinders(keys: HertzCylinder) -> tuple[UnassembledBodies, LineContact]:
     """Return the cylinders in contact under P alone, and Hertz's solution.
 
@@ -360,7 +295,7 @@ def two_cylinders(keys: HertzCylinder) -> tuple[UnassembledBodies, LineContact]:
     mesh, sides = shape.mesh, shape.mesh.boundaries
     flat, on_axis = sides["lower_flat"], _on_axis(sides, "lower_")
     f = _pressing(mesh, "upper_flat", 1.0)
-    if keys.peak:
+    if keys.Q:
         f += _pressing(mesh, "lower_flat", -1.0)
         fixed = np.append(on_axis, dofs_of(flat[flat.size // 2], 2, 1))
     else:
@@ -391,17 +326,6 @@ def _shearing(mesh: Mesh) -> Vector:
         # vertical forces ∝ x balance the moment of Q about the origin
         forces[nodes, 1] = Q * y[0] * share * x / (share @ x**2)
     return forces.ravel()
-
-
-def _loads(keys: HertzCylinder) -> list[tuple[float, float]]:
-    """Return the forces of each step with friction, as fractions of P and of μP."""
-    if keys.loading == "static":
-        return [(1.0, keys.Q)]
-    if keys.programme == "proportional":
-        # a ∝ √P grows by equal increments
-        parts = (np.arange(1, keys.steps + 1) / keys.steps) ** 2
-        return [(part, part * keys.Q) for part in parts]
-    return [(1.0, Q) for Q in dict.fromkeys((keys.peak, keys.Q))]
 
 
 def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> Mesh:
@@ -485,66 +409,43 @@ def pressure_quantities(
 def shear_quantities(
     bodies: UnassembledBodies,
     primal: QP,
-    exact: LineContact,
+    mindlin: TangentialContact,
     s: Solution,
     friction: Friction,
-    keys: HertzCylinder,
-    shear: Callable[[Vector], Vector],
+    sign: float,
 ) -> dict[str, Any]:
     """Compare the shear traction on the slave side with the exact one.
 
     The nodal traction is the horizontal friction force divided by ∫N_j dx. Errors are
-    relative; the error of the force is relative to the peak of the force.
-    `shear_centre` is the traction at x = 0. `stick_half_width` is the half width of the
-    stick zone for which the ratio of ∫x²q to ∫x²p, with shear traction q and pressure
-    p, is the same for the exact and for the computed tractions. In this ratio, the
-    effects of the finite bodies on the two moments cancel.
-    `stick_half_width` is absent for proportional quasi-static steps, where nothing
-    slips.
+    relative. `shear_centre` is the traction at x = 0. `stick_half_width` is the half
+    width of the stick zone for which the ratio of ∫x²q to ∫x²p, with shear traction q
+    and pressure p, is the same for the exact and for the computed tractions. In this
+    ratio, the effects of the finite bodies on the two moments cancel.
+
+    sign : 1 if the slave is the upper cylinder, −1 if it is the lower one
     """
-    slave, upper = bodies.pairs[0].slave, keys.slave == "upper"
+    slave = bodies.pairs[0].slave
     x = bodies.mesh.points[slave, 0]
     width = nodal_lengths(x[:, None])
     normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
     pressing = np.abs(as_vectors(primal.G.T @ normal, 2)[slave, 1])
-    force = as_vectors(friction.T.T @ tangential, 2)[slave, 0]
-    force = force * (1.0 if upper else -1.0)
-    mindlin = TangentialContact(exact, keys.mu, keys.Q, keys.peak)
-    Q = keys.Q * keys.mu * exact.P
-    expected, centre = shear(x), float(shear(np.zeros(1))[0])
+    force = sign * as_vectors(friction.T.T @ tangential, 2)[slave, 0]
+    Q = mindlin.Q * mindlin.mu * mindlin.normal.P
+    expected, centre = mindlin.traction(x), float(mindlin.traction(np.zeros(1))[0])
     q = force / width
     at_centre = float(np.interp(0.0, np.sort(x), q[np.argsort(x)]))
-    values = {
+    c = mindlin.stick_half_width(float(force @ x**2), float(pressing @ x**2))
+    return {
         "tangential_force": float(force.sum()),
-        "tangential_force_error": float(
-            (force.sum() - Q) / (keys.peak * keys.mu * exact.P)
-        ),
+        "tangential_force_error": float(force.sum() / Q - 1),
         "shear_centre": at_centre,
         "shear_centre_error": at_centre / centre - 1,
         "shear_l2_error": float(
             np.sqrt(width @ (q - expected) ** 2 / (width @ expected**2))
         ),
-    }
-    if _without_slip(keys):
-        return values
-    c = mindlin.stick_half_width(float(force @ x**2), float(pressing @ x**2))
-    return values | {
         "stick_half_width": c,
         "stick_half_width_error": c / mindlin.c - 1,
     }
-
-
-def _without_slip(keys: HertzCylinder) -> bool:
-    """Return True if P and Q grow in proportion, so that nothing slips."""
-    together = keys.programme == "proportional"
-    return together and keys.loading == "quasi-static"
-
-
-def _exact_shear(exact: LineContact, keys: HertzCylinder) -> Callable[[Vector], Vector]:
-    """Return the exact shear traction on the lower cylinder, Pa, for x in m."""
-    if _without_slip(keys):
-        return lambda x: exact.pressure(x) * (keys.Q * keys.mu)
-    return TangentialContact(exact, keys.mu, keys.Q, keys.peak).traction
 
 
 def _curve(

@@ -48,11 +48,7 @@ from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.results import pair_results
 from mortarbench.problems.contact.rigid import RigidPlane
 from mortarbench.problems.contact.sides import contact_sides
-from mortarbench.problems.contact.stepping import (
-    Stage,
-    load_steps,
-    restart_slip,
-)
+from mortarbench.problems.contact.stepping import load_steps, normal_first
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
@@ -81,6 +77,7 @@ from mortarbench.problems.keys import (
     Glue,
     Method,
     check_memory,
+    check_tangential,
     refuse_unused,
 )
 
@@ -165,10 +162,8 @@ class HertzSphere(ContactFamily):
         if self.against == "plane":
             for name in ("contact", "basis"):
                 refuse_unused(self, name, "against=plane", "against=sphere")
-        if not 0 <= self.Q < 1:
-            raise InputError(
-                f"Q={self.Q} must be at least 0 and below 1, a fraction of μP"
-            )
+        if self.Q:
+            check_tangential(self.Q)
         if self.Q and self.against == "plane":
             raise InputError(
                 f"Q={self.Q} is not supported with against=plane; expected "
@@ -226,7 +221,11 @@ class HertzSphere(ContactFamily):
             tangential = partial(tangential_force_stress, nu=self.nu)
             shearing = [_far_forces(b, tangential, 0) for b in blocks]
             f = pressing + self.Q * self.mu * np.concatenate(shearing)
-            stages = _programme(pressing, f, held, blocks[0].axis, self.mu)
+            # supports that prevent sliding and rolling; by symmetry they have no
+            # reactions
+            upright = dofs_of(blocks[0].axis[[0, -1]], 3, 0)
+            law = FrictionLaw("coulomb", mu=self.mu)
+            stages = normal_first(pressing, f, held, upright, law)
 
         def results(solution: ContactSolution) -> dict[str, Any]:
             """Compare with the exact solution; `approach` is of distant points, m."""
@@ -261,29 +260,6 @@ class HertzSphere(ContactFamily):
             linearise=keyed_linearisation(self.contact, self.basis, undeformed=True),
             results=results,
         )
-
-
-def _programme(
-    pressing: Vector, both: Vector, held: Nodes, axis: Nodes, mu: float
-) -> tuple[Stage, ...]:
-    """Return the stages of a tangential load: P without friction, then P and Q.
-
-    In the first stage, supports on the axis of the upper block prevent sliding and
-    rolling; by symmetry they have no reactions. Slip is measured from the end of this
-    stage.
-    """
-    upright = dofs_of(axis[[0, -1]], 3, 0)
-    return (
-        Stage(step=1, part=1.0, load=pressing, fixed=np.append(held, upright)),
-        Stage(
-            step=1,
-            part=1.0,
-            load=both,
-            fixed=held,
-            laws=(FrictionLaw("coulomb", mu=mu),),
-            begin=restart_slip,
-        ),
-    )
 
 
 def _block(a: float, R: float, n: int, up: int, copies: int) -> _Block:

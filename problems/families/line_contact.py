@@ -14,10 +14,7 @@ Q < μP applied after P, the zone c ≤ |x| ≤ a slips and the zone |x| < c sti
 
     q(x) = μp₀√(1 − x²/a²) − μp₀(c/a)√(1 − x²/c²),    c/a = √(1 − Q/μP)
 
-where square roots of negative numbers count as zero. If the force decreases from Q* to
-Q, |Q| ≤ Q*, reverse slip spreads from the edge of the contact. The traction is then
-q = q* − 2q′, where q* is the traction under Q*, and q′ is the traction under the force
-(Q* − Q)/2, with c′/a = √(1 − (Q* − Q)/2μP) (Mindlin and Deresiewicz 1953).
+where square roots of negative numbers count as zero.
 """
 
 from __future__ import annotations
@@ -58,36 +55,22 @@ class LineContact:
 
 @dataclass(frozen=True)
 class TangentialContact:
-    """Cattaneo and Mindlin's solution after loading to `peak` and unloading to `Q`."""
+    """Cattaneo and Mindlin's solution for a tangential force Q applied after P."""
 
     normal: LineContact
     mu: float
-    Q: float  #: tangential force in units of μP, between −peak and peak
-    peak: float  #: largest tangential force so far in units of μP; Q without unloading
-
-    @property
-    def before(self) -> TangentialContact:
-        """State at the peak, before unloading."""
-        return TangentialContact(self.normal, self.mu, self.peak, self.peak)
+    Q: float  #: tangential force in units of μP, between 0 and 1
 
     @property
     def semicircles(self) -> tuple[tuple[float, float], ...]:
-        """Pairs (w, c), in units of μP and a, with q = μP Σ w·2/(πc)√(1 − x²/c²).
-
-        The pairs of the loading come before those of the unloading.
-        """
-        # (c/a)², also the force of the semicircle of half width c
-        stuck = 1 - self.peak
-        loading = ((1.0, 1.0), (-stuck, np.sqrt(stuck)))
-        if self.Q == self.peak:
-            return loading
-        stuck = 1 - (self.peak - self.Q) / 2  # (c′/a)²
-        return (*loading, (-2.0, 1.0), (2 * stuck, np.sqrt(stuck)))
+        """Pairs (w, c), in units of μP and a, with q = μP Σ w·2/(πc)√(1 − x²/c²)."""
+        stuck = 1 - self.Q  # (c/a)², also the force of the semicircle of half width c
+        return (1.0, 1.0), (-stuck, np.sqrt(stuck))
 
     @property
     def c(self) -> float:
-        """Half width of the stick zone, m: c, or c′ after unloading."""
-        return float(self.normal.a * self.semicircles[-1][1])
+        """Half width of the stick zone, m."""
+        return float(self.normal.a * np.sqrt(1 - self.Q))
 
     def traction(self, x: Vector) -> Vector:
         """Return q(x), Pa."""
@@ -102,15 +85,12 @@ class TangentialContact:
     def stick_half_width(self, shear: float, pressure: float) -> float:
         """Return the half width c of the stick zone from moments of the tractions, m.
 
-        In loading,  ∫x²q = μPa²/4 (1 − (c/a)⁴)  and  ∫x²p = Pa²/4.  In unloading, the
-        traction at the peak is assumed to be exact. The result is clipped to [0, a].
+        ∫x²q = μPa²/4 (1 − (c/a)⁴)  and  ∫x²p = Pa²/4. The result is clipped to [0, a].
 
         shear, pressure : moments ∫x²q dx and ∫x²p dx, N·m
         """
-        # a semicircle of force w and half width c has the moment ∫x² = wc²/4
-        *others, (w, c) = self.semicircles
-        rest = shear / (self.mu * pressure) - sum(v * d**2 for v, d in others)
-        return float(self.normal.a * np.clip(rest * c**2 / w, 0, 1) ** 0.25)
+        rest = 1 - shear / (self.mu * pressure)
+        return float(self.normal.a * np.clip(rest, 0, 1) ** 0.25)
 
 
 def _root(s: Vector) -> Vector:

@@ -60,6 +60,7 @@ from mortarbench.problems.keys import (
     Bound,
     Law,
     check_fits,
+    check_tangential,
     refuse_unused,
 )
 
@@ -110,11 +111,7 @@ class HalfSpace(Family):
     def __post_init__(self) -> None:
         """Check that the law uses every key, and that the grid fits into memory."""
         super().__post_init__()
-        if not 0 < self.Q < 1:
-            raise InputError(
-                f"Q={self.Q} must be between 0 and 1, a fraction of the limit of "
-                "friction"
-            )
+        check_tangential(self.Q)
         self._check_law()
         needed = _CELL_BYTES * self.n**2 / 2**20
         check_fits(f"a grid of {self.n} × {self.n} cells takes", needed, "a grid")

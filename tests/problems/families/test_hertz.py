@@ -198,44 +198,12 @@ def test_slip_starts_at_the_edge_as_in_cattaneo_and_mindlin(Q, contact):
     assert got["friction_residual"] < 1e-8
 
 
-@pytest.mark.parametrize("Q", [0.2, pytest.param(-0.6, marks=pytest.mark.slow)])
-def test_unloading_causes_reverse_slip_from_the_edge(Q):
-    got = sheared_result(Q=Q, peak=0.6)
-
-    assert abs(got["stick_half_width_error"]) < 0.01
-    assert abs(got["shear_centre_error"]) < 0.01
-    assert got["shear_l2_error"] < 0.1
-    assert got["stick"] == pytest.approx(40 * np.sqrt(1 - (0.6 - Q) / 2), abs=2)
-
-
 @pytest.mark.slow
-def test_under_proportional_load_only_the_edge_nodes_slip():
-    """For a single static load, the tractions are as if Q had been applied last."""
-    keys = dict(n=6, m=6, Q=0.5)
-    got = sheared_result(**keys, steps=6, programme="proportional")
-    static = sheared_result(**keys, loading="static")
+def test_slip_from_the_undeformed_state_has_the_same_tractions():
+    got = sheared_result(n=6, m=6, Q=0.5, loading="static")
 
-    assert (got["slip"], static["slip"]) == (2, pytest.approx(12 * 0.29, abs=1.1))
-    assert abs(static["stick_half_width_error"]) < 0.03
-    assert static["dissipation"] > 10 * got["dissipation"]
-    assert "stick_half_width" not in got
-
-
-@pytest.mark.slow
-def test_under_proportional_load_shear_tends_to_a_fraction_of_the_pressure():
-    """The exact traction is (Q/P)p; halving h and the load step divides each error by
-    more than 1.4."""
-    errors = []
-    for n in (5, 10, 20):
-        got = sheared_result(
-            n=n, m=n, steps=n, load=0.1, Q=0.5, programme="proportional"
-        )
-        assert got["slip"] <= 2
-        errors.append([abs(got["shear_centre_error"]), got["shear_l2_error"]])
-
-    assert (np.divide(errors[:-1], errors[1:]) > 1.4).all()
-    assert errors[-1][0] < 0.1
-    assert errors[-1][1] < 0.06
+    assert abs(got["stick_half_width_error"]) < 0.03
+    assert got["slip"] == pytest.approx(12 * 0.29, abs=1.1)
 
 
 def test_the_tangential_force_rotates_no_body():
