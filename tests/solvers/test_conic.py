@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from time import process_time
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from mortarbench.harness import QP, Cones, Discs, Solution, Status
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.common.conversion import to_cone
+from tests.support.bounded import bounded
 
 WILDCARDS = ("cvxpy:CLARABEL", "cvxpy:SCS", "cvxpy:QOCO")
 NATIVE = ("clarabel", "scs", "qoco")
@@ -148,16 +148,16 @@ def test_a_warm_start_is_a_point_of_the_cones():
             assert back[name] == pytest.approx(getattr(best, name), abs=1e-12)
 
 
-def test_a_hundred_thousand_discs_are_converted_in_seconds():
-    k, began = 100_000, process_time()
+def test_a_hundred_thousand_discs_are_converted_without_dense_arrays():
+    k = 100_000
     eye, none = eye_array(3 * k, format="csr"), csr_array((0, 3 * k))
     sets = (Discs(np.arange(3 * k).reshape(k, 3), np.ones(k)),)
     qp = QP(P=eye, q=np.ones(3 * k), A=none, b=np.zeros(0), G=none, h=np.zeros(0),
             sets=sets)  # fmt: skip
-    form = to_cone(qp)
-    back = form.multipliers(np.ones(form.rhs.size))
+    with bounded():
+        form = to_cone(qp)
+        back = form.multipliers(np.ones(form.rhs.size))
 
-    assert process_time() - began <= 2.0
     assert form.rows.shape == (4 * k, 3 * k)
     assert (back["z_box"] == -1).all()
 

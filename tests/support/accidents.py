@@ -52,18 +52,20 @@ def runs(process):
 
 
 class Witness(Honest):
-    """Solver that fails if another process of the run uses a CPU."""
+    """Solver that fails if other processes of the run use a CPU for 0.1 s."""
 
     def act(self, qp):
         mine = {os.getppid(), *descendants(os.getppid())}
-        awake = [
-            process
-            for process in processes(os.environ["WATCHED"])
-            if process not in mine and runs(process)
-        ]
-        if awake:
-            raise RuntimeError(f"disturbed by {awake}")
-        return at_the_row(qp)
+        for _ in range(10):  # parents of workers wake up for a moment every second
+            awake = [
+                process
+                for process in processes(os.environ["WATCHED"])
+                if process not in mine and runs(process)
+            ]
+            if not awake:
+                return at_the_row(qp)
+            time.sleep(0.01)
+        raise RuntimeError(f"disturbed by {awake}")
 
 
 def reply_pipe():
@@ -165,8 +167,7 @@ class HoardsInShm(Honest):
         hoard = mmap.mmap(-1, 600 * 2**20)
         for _ in range(600):
             hoard.write(bytes(2**20))
-        time.sleep(1)
-        return at_the_row(qp)
+        time.sleep(3600)
 
 
 class SharesPages(Honest):
@@ -203,8 +204,7 @@ class HoardsInADaemon(Honest):
             os._exit(0)
         os.wait()
         os.read(hoarded, 3)
-        time.sleep(1)
-        return at_the_row(qp)
+        time.sleep(3600)
 
 
 def spin(seconds):

@@ -17,7 +17,6 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Timer
 from typing import ClassVar
 
 import numpy as np
@@ -121,14 +120,6 @@ class Dies(Honest):
         os._exit(7)
 
 
-class DiesLater(Honest):
-    """Solver that returns an answer and ends the process a moment later."""
-
-    def act(self, qp):
-        Timer(0.3, os._exit, [7]).start()
-        return replace(at_the_row(qp), counts={"process": os.getpid()})
-
-
 class Segfaults(Honest):
     def act(self, qp):
         ctypes.string_at(0)
@@ -226,7 +217,7 @@ class Leaks(Honest):
     def act(self, qp):
         hoard = []
         while True:
-            hoard.append(np.ones(2**20))  # 8 MiB
+            hoard.append(np.ones(2**22))  # 32 MiB
             time.sleep(0.001)
 
 

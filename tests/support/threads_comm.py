@@ -3,7 +3,7 @@
 `ThreadComm` passes messages in memory, so that a test on three ranks takes
 milliseconds. It replaces mpi4py's communicator only; all methods of the communicator of
 the package are executed. Values are pickled, as in mpi4py. A rank that waits for
-another one fails after `PATIENCE` seconds, or as soon as another rank has failed.
+another one fails after `LONGEST` seconds, or as soon as another rank has failed.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import pytest
 
 from mortarbench.harness.distributed.comm import Comm, Team, _MPIComm
 from mortarbench.problems.feti.operators import DualOperator
+from tests.support.waiting import LONGEST
 
-PATIENCE = 20.0  #: s; a busy machine may stop a thread for seconds
 T = TypeVar("T")
 
 
@@ -38,9 +38,9 @@ class ThreadComm:
 
     def _exchange(self, value: Any) -> list[Any]:
         self._shared.slots[self.rank] = pickle.dumps(value)
-        self._shared.barrier.wait(PATIENCE)
+        self._shared.barrier.wait(LONGEST)
         found = list(map(pickle.loads, self._shared.slots))
-        self._shared.barrier.wait(PATIENCE)
+        self._shared.barrier.wait(LONGEST)
         return found
 
     def Dup(self) -> ThreadComm:
@@ -76,7 +76,7 @@ class ThreadComm:
         return not self._shared.inboxes[self.rank].empty()
 
     def recv(self, source: int, tag: int) -> Any:
-        return pickle.loads(self._shared.inboxes[self.rank].get(timeout=PATIENCE))
+        return pickle.loads(self._shared.inboxes[self.rank].get(timeout=LONGEST))
 
     def Iallgather(self, part: np.ndarray, every: np.ndarray) -> Any:
         here = self._shared.gathered.setdefault(self._rounds, {})

@@ -366,9 +366,12 @@ def test_a_full_disk_and_a_lost_file_are_faults(bench, tmp_path, write, message)
         bench("honest", command=[sys.executable, "-P", str(program)])
 
 
-def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_worker_killed_while_it_is_idle_costs_nothing(bench, waits):
     bench("honest")
-    os.kill(bench.process("honest"), signal.SIGKILL)
+    process = bench.process("honest")
+    os.kill(process, signal.SIGKILL)
+    assert not waits or soon(lambda: not is_alive(process))
 
     assert bench("honest").status is Verdict.VERIFIED
 

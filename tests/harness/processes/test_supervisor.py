@@ -103,13 +103,6 @@ def test_one_process_serves_every_measurement_on_one_cpu_with_one_thread(
     assert not is_alive(first["pid"])
 
 
-def test_a_crash_between_measurements_is_not_attributed_to_the_next_one(ask):
-    first = ask("dieslater")
-    assert soon(lambda: not is_alive(first.answer["counts"]["process"]))
-
-    assert ask("dieslater").answer["claimed"] == "solved"
-
-
 def test_a_solver_that_hangs_in_the_warm_up_is_killed_at_the_time_limit(
     ask, monkeypatch
 ):

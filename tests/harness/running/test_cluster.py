@@ -20,7 +20,7 @@ from mortarbench.harness.results.folder import environment_of
 from mortarbench.harness.results.journal import read_journal
 from tests.support import ROOT, TOY_PROBLEM, WRITE_REPORT, no_report
 from tests.support.toy_registries import toy_registries
-from tests.support.waiting import soon
+from tests.support.waiting import LONGEST, soon
 
 Client = pytest.importorskip("distributed").Client
 
@@ -154,7 +154,7 @@ def test_two_workers_measure_the_same_as_one_although_one_is_killed(
     cluster.join()
     cluster.starts.write_text("")
     with Client(cluster.address) as client:
-        client.wait_for_workers(2, 30)
+        client.wait_for_workers(2, LONGEST)
 
     def kill():
         assert soon(lambda: victim.pid in map(node_of, cluster.started_solvers()))
