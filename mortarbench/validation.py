@@ -34,7 +34,7 @@ _EQUAL_FAILURES = 3  #: smallest number of checks with equal failures that are o
 class Validation:
     """Result of a cross-validation."""
 
-    agreed: bool  #: True if no claim is refuted and no certificate is wrong
+    agreed: bool  #: True if no claim is refuted
     data: Mapping[str, Any]  #: contents of validation.json
     pages: tuple[Path, ...]  #: files of the page on the validation
 

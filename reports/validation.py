@@ -29,7 +29,6 @@ SCHEMA = 2  #: version of the format of the summary
 #: titles of the tables of answers, by outcome
 OUTCOMES = {
     "refuted": "Refuted claims",
-    "contradicted": "Certificates that the reference contradicts",
     "unanswered": "Measurements without a claim of success",
     "not validated": "Answers that could not be judged",
 }
@@ -57,7 +56,7 @@ def summary(answers: Sequence[Answer], folder: str) -> dict[str, Any]:
     Returns
     -------
     a dict with
-    agreed : True if no claim is refuted and no certificate is contradicted
+    agreed : True if no claim is refuted
     headline : one or two sentences
     counts : numbers of distinct stored points (`answers`), of their solvers and cases,
         and of the answers with each outcome
@@ -75,7 +74,7 @@ def summary(answers: Sequence[Answer], folder: str) -> dict[str, Any]:
     data = {
         "schema": SCHEMA,
         "folder": folder,
-        "agreed": not counts["refuted"] + counts["contradicted"],
+        "agreed": not counts["refuted"],
         "headline": _headline(counts, answers),
         "counts": counts,
         "solvers": [
@@ -111,17 +110,10 @@ def _row(answers: Sequence[Answer]) -> dict[str, Any]:
 def _headline(counts: Mapping[str, int], answers: Sequence[Answer]) -> str:
     """Return the result of the cross-validation as one or two sentences."""
     what = _scope(counts)
-    if proven := counts["proven"]:
-        what += f", {plural(proven, 'claim')} of infeasibility proven"
     culprits = sorted({a.solver for a in answers if a.outcome is Outcome.REFUTED})
-    wrong = []
     if culprits:
         claims = plural(counts["refuted"], "refuted claim")
-        wrong.append(f"{claims} of {some(culprits, 6)}")
-    if contradicted := counts["contradicted"]:
-        wrong.append(plural(contradicted, "contradicted certificate"))
-    if wrong:
-        return f"Disagreement: {' and '.join(wrong)}. {what}."
+        return f"Disagreement: {claims} of {some(culprits, 6)}. {what}."
     return f"No disagreement: {what}; every claim of success stands."
 
 

@@ -1,12 +1,12 @@
 """Comparison of the answers to one problem with a reference solution.
 
 Let u and λ be the displacement and the multipliers of an answer, and u* and λ* those of
-the reference, which is computed independently of the solvers under test
-(`harness.crossval.references`). Let ‖·‖ be the energy norm, and u_λ the displacement in
-equilibrium with the load and the contact forces −Bᵀλ. An answer is verified at
-tolerance t if its KKT residuals are at most 10t. The residual of the duality gap g is
-g/E with an energy E; here, E is taken to be ‖u*‖². By the identity of Prager and Synge
-(`harness.verify.certificate`, (2)),
+the reference: the answer of a solver that is not under test, corrected to an admissible
+pair and certified by `harness.verify.certificate`. Let ‖·‖ be the energy norm, and u_λ
+the displacement in equilibrium with the load and the contact forces −Bᵀλ. An answer is
+verified at tolerance t if its KKT residuals are at most 10t. The residual of the
+duality gap g is g/E with an energy E; here, E is taken to be ‖u*‖². By the identity of
+Prager and Synge (`harness.verify.certificate`, (2)),
 
     ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
 
@@ -28,14 +28,14 @@ from typing import Any
 
 import numpy as np
 
-from mortarbench.harness.crossval.references import UnsolvedError, reference_point
-from mortarbench.harness.mechanics import Extended, Mechanics, Real
+from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.record import Record
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.active_set_refinement import equilibrium
-from mortarbench.harness.verify.kkt import allowed, kkt_residuals, verdict
+from mortarbench.harness.verify.certificate import certify
+from mortarbench.harness.verify.kkt import allowed, kkt_residuals
 from mortarbench.harness.verify.verdicts import note_of
 
 #: Largest KKT residual of a reference of a QP without mechanics.
@@ -47,9 +47,7 @@ class Outcome(StrEnum):
 
     AGREES = "agrees"
     REFUTED = "refuted"  #: the claim of the solver is false
-    CONTRADICTED = "contradicted"  #: the reference contradicts a certificate of the run
-    PROVEN = "proven"  #: a certificate proves the claim that there is no solution
-    UNANSWERED = "unanswered"  #: the solver does not claim to have an answer
+    UNANSWERED = "unanswered"  #: the solver does not claim to have a point
     NOT_VALIDATED = "not validated"  #: the answer cannot be judged
 
 
@@ -68,7 +66,7 @@ class Answer:
     tol: float
     claimed: str
     outcome: Outcome
-    text: str = ""  #: reasons for the outcome, and anomalies of the stored point
+    text: str = ""  #: reasons for the outcome
     residual: float | None = None  #: largest KKT residual of the stored point
     error: float | None = None  #: ‖u − u*‖
     force_error: float | None = None  #: ‖u_λ − u*‖
@@ -92,7 +90,6 @@ class StoredAnswer:
     record: Record
     case: Case
     solution: Solution
-    remark: str = ""  #: anomaly of the stored point
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -142,15 +139,10 @@ def compare_answers(answers: Sequence[StoredAnswer], solve: Reference) -> list[A
         without mechanics
     solve : function that solves a QP accurately
     """
-    case = answers[0].case
-    try:
-        if case.mechanics is None:
-            reference = _plain_reference(case.qp, solve)
-        else:
-            reference = _elastic_reference(case.mechanics.whole, solve)
+    try:  # the smallest form of the problem is solved
+        reference = _reference(min((g.case for g in answers), key=_size), solve)
     except Exception as e:  # also raised by code of the family
-        why = str(e) if isinstance(e, UnsolvedError) else note_of("reference", e)
-        return [_judged(g, why) for g in answers]
+        return [_judged(g, note_of("reference", e)) for g in answers]
     judged: list[Answer] = []
     deviations: list[tuple[Record, Any]] = []
     for g in answers:
@@ -179,13 +171,19 @@ def compare_answers(answers: Sequence[StoredAnswer], solve: Reference) -> list[A
     return judged
 
 
-def _elastic_reference(mechanics: Mechanics, solve: Reference) -> _Reference:
-    """Return the certified solution of an elastic problem.
+def _size(case: Case) -> int:
+    return case.qp.q.size
 
-    If ‖u*‖ = 0, errors are relative to the energy norm of the displacement under the
-    load without contact.
-    """
-    (point, _), exact = reference_point(mechanics, solve), mechanics.exact
+
+def _reference(case: Case, solve: Reference) -> _Reference:
+    """Return the certified solution of an elastic problem."""
+    if case.mechanics is None:
+        return _plain_reference(case.qp, solve)
+    mechanics = case.mechanics.whole
+    point, exact = (
+        certify(mechanics, mechanics.to_primal(solve(case.qp))),
+        mechanics.exact,
+    )
 
     def deviations(g: StoredAnswer) -> tuple[Extended, Extended]:
         assert g.case.mechanics is not None
@@ -197,23 +195,29 @@ def _elastic_reference(mechanics: Mechanics, solve: Reference) -> _Reference:
     return _Reference(
         bound=point.bound,
         norm=mechanics.norm,
-        length=point.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0]),
+        length=point.norm,
         deviations=deviations,
     )
 
 
 def _plain_reference(qp: QP, solve: Reference) -> _Reference:
-    """Return the solution of a QP without mechanics; raise UnsolvedError if it is bad.
+    """Return the solution of a QP without mechanics.
 
     Errors do not depend on the choice of the solution, since Px is equal for all
     solutions. The assumed bound on the error of the reference is √(2r), where r is its
     largest KKT residual. For verified answers, the same formula holds with the largest
     permitted r. The scale of errors is √max(x*ᵀPx*, |qᵀx*|).
+
+    Raises
+    ------
+    ArithmeticError
+        If r exceeds `MAX_REFERENCE_RESIDUAL`.
+
     """
     truth = solve(qp)
     worst = kkt_residuals(qp, truth).worst
     if not worst <= MAX_REFERENCE_RESIDUAL:
-        raise UnsolvedError(f"the reference solve left a KKT residual of {worst:.1e}")
+        raise ArithmeticError(f"the reference solve left a KKT residual of {worst:.1e}")
     return _Reference(
         bound=float(np.sqrt(2 * worst)),
         norm=lambda v: float(np.sqrt(max(v @ (qp.P @ v), 0.0))),
@@ -228,22 +232,14 @@ def _judged(g: StoredAnswer, unassessed: str = "", **errors: float | None) -> An
     unassessed : reason why the errors are unknown
     errors : fields of the answer
     """
-    r = g.record
-    residuals = kkt_residuals(g.case.qp, g.solution)
-    answer = answer_of(r, Outcome.AGREES, "", residual=residuals.worst, **errors)
-    now = verdict(g.solution.status, residuals, answer.tol)
-    reasons = list(_refutations(answer)) if r.claimed == Status.SOLVED else []
+    worst = kkt_residuals(g.case.qp, g.solution).worst
+    answer = answer_of(g.record, Outcome.AGREES, "", residual=worst, **errors)
+    reasons = list(_refutations(answer)) if answer.claimed == Status.SOLVED else []
     if reasons:
-        outcome = Outcome.REFUTED
-    elif unassessed:
-        outcome, reasons = Outcome.NOT_VALIDATED, [unassessed]
-    # the certificate of the run is of another point if there is a remark
-    elif now is r.status and not g.remark and (broken := _contradiction(answer, r)):
-        outcome, reasons = Outcome.CONTRADICTED, [broken]
-    else:
-        outcome = Outcome.AGREES
-    text = "; ".join([*reasons, *[g.remark] * bool(g.remark)])
-    return replace(answer, outcome=outcome, text=text)
+        return replace(answer, outcome=Outcome.REFUTED, text="; ".join(reasons))
+    if unassessed:
+        return replace(answer, outcome=Outcome.NOT_VALIDATED, text=unassessed)
+    return answer
 
 
 def _refutations(a: Answer) -> Iterator[str]:
@@ -260,19 +256,6 @@ def _refutations(a: Answer) -> Iterator[str]:
     ):
         if error is not None and not error - a.reference_error <= most:
             yield f"error of {what} {brief(error)} > {brief(most)} in the energy norm"
-
-
-def _contradiction(a: Answer, r: Record) -> str:
-    """Describe an error that exceeds the bound certified in the run, or return "".
-
-    Certified bounds above 1 % are not examined.
-    """
-    if a.error is None or r.energy_bound is None or r.energy_bound > 0.01:
-        return ""
-    least = a.error - (a.reference_error or 0.0)
-    if least <= 1.01 * r.energy_bound + 1e-15:
-        return ""
-    return f"error {brief(least)}, certified at most {brief(r.energy_bound)}"
 
 
 def brief(value: float) -> str:

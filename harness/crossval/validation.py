@@ -23,20 +23,14 @@ from mortarbench.harness.crossval.comparison import (
 )
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
-from mortarbench.harness.files.store import (
-    digest_of,
-    load_solution,
-    point_arrays,
-)
+from mortarbench.harness.files.store import load_solution
 from mortarbench.harness.plugin import Case, Family, Reference
-from mortarbench.harness.record import PROVEN, Record, Verdict
+from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.stored_run import rebuild
-from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
-from mortarbench.harness.verify.infeasibility import certificate_of
+from mortarbench.harness.solution import NO_SOLUTION, Status
 from mortarbench.harness.verify.verdicts import has_point
 
-_CHANGED = "the file of the stored point was changed after the measurement"
 #: Largest error bound of a reference point that refutes a claim of infeasibility.
 MAX_SOLUTION_ERROR = 1e-2
 Build = Callable[[Record], Case]  #: builds the case of a record again
@@ -104,7 +98,7 @@ def _group(
     """
     cases: dict[str, Case | InputError] = {}
     judged: list[Answer] = []
-    pointless: list[tuple[Record, Case | None]] = []
+    pointless: list[Record] = []
     seen: set[tuple[str, str, float, str]] = set()
     by_problem: dict[str, list[StoredAnswer]] = {}
     for r in records:
@@ -113,11 +107,11 @@ def _group(
         if key in seen:  # the point of an earlier repeat
             continue
         seen.add(key)
+        if not r.vectors or not claims_point:
+            pointless.append(r)
+            continue
         try:
-            case = _case(r, cases, build) if r.vectors or r.status in PROVEN else None
-            if not r.vectors or not claims_point or case is None:
-                pointless.append((r, case))
-                continue
+            case = _case(r, cases, build)
             elastic = case.mechanics
             problem = r.case if elastic is None else qp_digest(elastic.program)
             answer = _stored_answer(path, r, case)
@@ -133,12 +127,10 @@ def _group(
         names = [problem] if problem in cases else [r.case for r in records]
         bounds = [b for a in compared if (b := a.reference_error) is not None]
         solved |= dict.fromkeys(names, min(bounds, default=inf))
-    return judged + [
-        _without_point(r, case, solved.get(r.case, inf)) for r, case in pointless
-    ]
+    return judged + [_without_point(r, solved.get(r.case, inf)) for r in pointless]
 
 
-def _without_point(r: Record, case: Case | None, solved: float) -> Answer:
+def _without_point(r: Record, solved: float) -> Answer:
     """Judge a measurement without a point.
 
     solved : error bound of a solution of the problem; inf if there is none
@@ -146,21 +138,12 @@ def _without_point(r: Record, case: Case | None, solved: float) -> Answer:
     if r.claimed == Status.SOLVED:
         text = "claims success without a finite point"
         return answer_of(r, Outcome.REFUTED, text)
-    if r.status in PROVEN and case is not None:
-        # the run did not store the certificate of the solver: search for a new one
-        claim = Solution.without_point(case.qp, Status(r.claimed or "infeasible"))
-        holds, why = certificate_of(case.qp, claim, r.judged_at)
-        if holds:
-            return answer_of(r, Outcome.PROVEN, why)
     if r.claimed in NO_SOLUTION and solved < MAX_SOLUTION_ERROR:
         text = (
             "claims that there is no solution; the reference is one, with an error of "
             f"at most {brief(solved)}"
         )
         return answer_of(r, Outcome.REFUTED, text)
-    if r.status in PROVEN:
-        text = "the certificate could not be computed again"
-        return answer_of(r, Outcome.NOT_VALIDATED, text)
     text = ": ".join(filter(None, (r.status.words, r.message)))
     return answer_of(r, Outcome.UNANSWERED, text)
 
@@ -194,7 +177,4 @@ def _stored_answer(path: Path, r: Record, case: Case) -> StoredAnswer:
     if (wrong := s.mismatch(case.qp)) or not has_point(s):
         file = path / "vectors" / f"{r.vectors}.npz"
         raise InputError(f"{file}: {wrong or 'NaN or inf'}")
-    changed = digest_of(point_arrays(s)) != r.vectors
-    return StoredAnswer(
-        record=r, case=case, solution=s, remark=_CHANGED if changed else ""
-    )
+    return StoredAnswer(record=r, case=case, solution=s)

@@ -6,7 +6,6 @@ import re
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from mortarbench.harness.files import npz
 from mortarbench.harness.files.durable import replace_file, replacing
 from mortarbench.harness.files.reading import opened
 from mortarbench.harness.plugin import ContactSide, Fields
-from mortarbench.harness.solution import History, Solution, Status, checked_history
+from mortarbench.harness.solution import Solution, Status, checked_history
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -38,11 +37,10 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
     Raises
     ------
     InputError
-        If the file of the point is missing or damaged.
+        If the file is missing or damaged, or its content does not match `digest`.
 
     """
-    with _restorable():
-        return read_point(_path(folder, digest), status)
+    return _solution(_path(folder, digest), _stored(folder, digest, POINT), status)
 
 
 def field_arrays(fields: Fields) -> Arrays:
@@ -64,11 +62,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
         If the file is missing or damaged, or its content does not match `digest`.
 
     """
-    with _restorable():
-        path = _path(folder, digest)
-        arrays = read_arrays(path, ("points", "displacement"))
-        if digest_of(arrays) != digest:
-            raise InputError(f"{path}: its content does not match its digest")
+    arrays = _stored(folder, digest, ("points", "displacement"))
     sides: list[ContactSide] = []
     while side := with_prefix(_SIDE.format(len(sides)), arrays):
         sides.append(ContactSide(name=str(side.pop("name")), **side))
@@ -90,9 +84,15 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
 
 def read_point(path: Path, status: Status) -> Solution:
     """Read a file written by `write_point` as a `Solution` that claims `status`."""
-    arrays = read_arrays(path, POINT)
+    return _solution(path, read_arrays(path, POINT), status)
+
+
+def _solution(path: Path, arrays: Arrays, status: Status) -> Solution:
+    try:
+        history = checked_history(with_prefix(_HISTORY, arrays))
+    except ValueError as e:
+        raise InputError(f"{path}: malformed history: {e}") from None
     x, y, z, z_box = (arrays[name] for name in POINT)
-    history = _history(path, arrays)
     return Solution(status=status, x=x, y=y, z=z, z_box=z_box, history=history)
 
 
@@ -128,14 +128,6 @@ def point_arrays(solution: Solution) -> Arrays:
     return point | {_HISTORY + name: v for name, v in solution.history.items()}
 
 
-def _history(path: Path, arrays: Arrays) -> History:
-    """Return the history stored with a point; it is empty for files of old versions."""
-    try:
-        return checked_history(with_prefix(_HISTORY, arrays))
-    except ValueError as e:
-        raise InputError(f"{path}: malformed history: {e}") from None
-
-
 def with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
     """Return the arrays whose names have a prefix, by name without the prefix."""
     return {
@@ -145,13 +137,18 @@ def with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
     }
 
 
-@contextmanager
-def _restorable() -> Iterator[None]:
-    """Add a remedy to errors about files of a result folder that the block raises."""
+def _stored(
+    folder: Path, digest: str, expected: tuple[str, ...]
+) -> dict[str, NDArray[Any]]:
+    """Read stored arrays; raise InputError with a remedy if they are damaged."""
+    path = _path(folder, digest)
     try:
-        yield
+        arrays = read_arrays(path, expected)
+        if digest_of(arrays) != digest:
+            raise InputError(f"{path}: its content does not match its digest")
     except InputError as e:
         raise InputError(f"{e}; restore the file, or run with --fresh") from None
+    return arrays
 
 
 def is_stored(folder: Path, digest: str) -> bool:

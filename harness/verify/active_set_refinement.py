@@ -16,18 +16,12 @@ recurs, or at the latest after a given number of exchanges.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness.mechanics import (
-    AdmissibleForces,
-    Exact,
-    Extended,
-    Mechanics,
-    Real,
-)
+from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
 from mortarbench.harness.sets.blocks import norms
 from mortarbench.harness.verify.admissible import closing
 
@@ -98,24 +92,10 @@ def suggested(exact: Exact, u: Extended, multipliers: Extended) -> ActiveSet:
     """Guess the states from a pair (u, λ): rows with λ + v/D inside Λ are closed.
 
     Here, v = Bu − c, and D is the compliance of the row. A primal-dual active set
-    method uses this rule to determine the next active set.
+    method uses this rule to determine the next active set. For rows that are not
+    closed, `limits` of the result is the projection of λ + v/D onto Λ.
     """
-    return predicted(exact.forces, multipliers, exact.compliance, exact.motion(u))
-
-
-def predicted(
-    forces: AdmissibleForces, multipliers: Any, softness: Any, v: Any
-) -> ActiveSet:
-    """Return the states of the rows; a row is closed if λ + v/D is inside Λ.
-
-    For rows that are not closed, `limits` of the result is the projection of λ + v/D
-    onto Λ.
-
-    multipliers : λ (m,)
-    softness : (m,) compliances D ≥ 0 of the rows
-    v : (m,) motion Bu − c
-    """
-    discs = forces.discs
+    discs, softness, v = exact.forces.discs, exact.compliance, exact.motion(u)
     states = np.where(multipliers * softness <= -v, LOWER, CLOSED)
     limits = np.zeros_like(multipliers)
     soft = softness[discs.index].mean(axis=1, keepdims=True)

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from mortarbench.harness import Mechanics, Solution, Status
-from mortarbench.harness.crossval.references import reference_point
+from mortarbench.harness import Case, Mechanics, Solution, Status
 from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.sets.convex import hull
 from mortarbench.harness.verify.active_set_refinement import (
@@ -29,8 +28,11 @@ from mortarbench.harness.verify.active_set_refinement import (
     LOWER,
     UPPER,
     States,
+    exchanged,
+    suggested,
 )
-from mortarbench.harness.verify.certificate import Certificate
+from mortarbench.harness.verify.certificate import Certificate, proof
+from mortarbench.harness.verify.substructured import Split
 from mortarbench.solvers.reference.solve import reference_solution
 
 BITS = 500  #: number of bits after the binary point
@@ -147,7 +149,18 @@ class ExactSolution:
         return error / self.norm, error / within if error else 0.0
 
 
-def exact_solution(mechanics: Mechanics) -> ExactSolution:
+def refined_point(case: Case) -> tuple[Certificate, States]:
+    """Return the solution in extended precision, with its bound, and the row states."""
+    assert case.mechanics is not None
+    mechanics = case.mechanics.whole
+    exact, s = mechanics.exact, mechanics.to_primal(reference_solution(case.qp))
+    lam = mechanics.multipliers(s).astype(Real)
+    active = suggested(exact, s.x.astype(Real), lam)
+    u, lam, active = exchanged(mechanics, active)
+    return proof(Split(mechanics), u, u, lam, active.closed), active.states
+
+
+def exact_solution(case: Case) -> ExactSolution:
     """Solve the stored problem; fix rigid motions that closed rows do not prevent.
 
     Raises
@@ -157,8 +170,9 @@ def exact_solution(mechanics: Mechanics) -> ExactSolution:
         refinement does not converge.
 
     """
-    mechanics = mechanics.whole
-    near, states = reference_point(mechanics, reference_solution)
+    near, states = refined_point(case)
+    assert case.mechanics is not None
+    mechanics = case.mechanics.whole
     pinned = near.u
     for _ in range(12):
         u, lam = _given(mechanics, states, pinned)

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import Case, UncertifiableError, certify
-from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import certify_pair
 from mortarbench.problems import PROBLEMS
@@ -28,6 +27,7 @@ from tests.support.exact_solutions import (
     Rows,
     exact_solution,
     integers,
+    refined_point,
 )
 from tests.support.incline import block_on_incline
 from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
@@ -124,7 +124,7 @@ def known(name: str) -> tuple[Case, ExactSolution]:
     else:
         case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
-    return case, exact_solution(case.mechanics)
+    return case, exact_solution(case)
 
 
 def certified(name: str, answers, bodies=None) -> Found:
@@ -166,7 +166,7 @@ def test_no_error_in_space_exceeds_its_bound(name, count):
     """Errors are relative to a reference solution, whose error is bounded."""
     case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
     mechanics, rng = case.mechanics, np.random.default_rng(577)
-    exact, _ = reference_point(mechanics, reference_solution)
+    exact, _ = refined_point(case)
     answer = mechanics.to_primal(reference_solution(case.qp))
     for i in range(count):
         s = disturbed(answer, i, rng, mechanics)
@@ -321,7 +321,7 @@ def test_an_answer_that_moves_bodies_with_their_supports_strains_the_stored_matr
 def test_the_solution_for_the_stored_matrix_is_the_reference(name):
     """The ratio of stiffnesses is 1e-9, so a body moves far relative to its strain."""
     case, exact = known(f"{name}/ratio=1e-9")
-    point, _ = reference_point(case.mechanics, reference_solution)
+    point, _ = refined_point(case)
 
     assert exact.error(point.u) <= point.bound * exact.norm < 1e-7 * exact.norm
 

@@ -15,7 +15,6 @@ from numpy.testing import assert_allclose
 from scipy.sparse import block_diag
 
 from mortarbench.harness import Mechanics, UncertifiableError, certify
-from mortarbench.harness.crossval.references import reference_point
 from mortarbench.harness.mechanics import DecomposedMechanics, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import Certificate, certify_pair
@@ -25,6 +24,7 @@ from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 from tests.support.decomposed_bodies import mechanics_of, parts_of
+from tests.support.exact_solutions import refined_point
 from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
 
 pytestmark = pytest.mark.together
@@ -39,7 +39,7 @@ def known(name: str) -> tuple[Mechanics, DecomposedMechanics, Certificate]:
     case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
     whole = case.mechanics.whole
-    exact, _ = reference_point(whole, reference_solution)
+    exact, _ = refined_point(case)
     return whole, mechanics_of(parts_of(f"{name}/dual")), exact
 
 
@@ -52,7 +52,7 @@ def excess_of_rounding(name: str, tols: tuple[float, ...]) -> list[float]:
     case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
     whole, ratios = case.mechanics.whole, list[float]()
-    exact, _ = reference_point(whole, reference_solution)
+    exact, _ = refined_point(case)
     for tol in tols:
         s = case.mechanics.to_primal(SMALBE().prepare(case.qp, tol)())
         found = certify(case.mechanics, s)
