@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
-from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.plugin import Family, Reference, Solver
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.registry import (
@@ -234,24 +232,11 @@ class Registries:
         )
 
     def environment(self) -> dict[str, Any]:
-        """Return the environment of the processes of a run; see `capture`.
-
-        If this process is limited to one thread, like the processes of a run, it
-        captures its own environment. Otherwise, for example in a notebook with other
-        libraries, a new process captures the environment.
-        """
-        from mortarbench.harness.environment.environment import (
-            capture,
-            capture_in_worker,
-        )
+        """Return the environment of the processes of a run; see `capture`."""
+        from mortarbench.harness.environment.environment import capture
         from mortarbench.solvers.common.libraries import PACKAGES
 
-        if ONE_THREAD.items() <= os.environ.items():
-            here = capture(self.files, PACKAGES)
-            if all(pool["threads"] == 1 for pool in here["threads"]["pools"]):
-                return here
-            # if not, the limits were set after the libraries had been loaded
-        return capture_in_worker(self.files, PACKAGES)
+        return capture(self.files, PACKAGES)
 
     def _absolute_files(self, label: str = "") -> list[str]:
         """Return the plug-in files, those with a label first.

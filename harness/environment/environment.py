@@ -11,7 +11,6 @@ import os
 import platform
 import re
 import subprocess
-import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -34,11 +33,10 @@ THREAD_VARIABLES = (
     "RAYON_NUM_THREADS",
 )  # fmt: skip
 
-#: owners of libraries whose thread pools the code of mortarbench may use: the operating
-#: system, or the wheel of a package
+#: owners of a BLAS that the code of mortarbench may use: the operating system, or the
+#: wheel of a package
 OWNERS = ("system", "numpy", "scipy", "scikit_sparse")
 
-REFERENCE_BLAS = "reference BLAS"
 VOLATILE = ("now",)  #: keys of an environment that its digest excludes
 
 #: folders of a checkout that contain code
@@ -51,8 +49,7 @@ def capture(
 ) -> dict[str, Any]:
     """Describe the environment of this process as nested plain data.
 
-    Values that cannot be read are None. The entries on threads describe the calling
-    process; `capture_in_worker` describes the threads of a worker.
+    Values that cannot be read are None. The variables are those of a worker.
 
     plugins : plug-in files; digests of their code are included
     packages : packages of solvers whose versions are included
@@ -64,28 +61,17 @@ def capture(
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
         with suppress(ImportError):
             import_module(module)
-    # filter by owner, since plug-ins or a notebook may have loaded other libraries
-    pools = sorted(
-        (p for p in map(_pool, threadpool_info()) if p["owner"] in OWNERS),
-        key=lambda p: (p["library"], p["owner"]),
-    )
-    maps = _read(Path("/proc/self/maps"))
-    cholmod = re.search(r"/libcholmod[^/]*\.so\.([\d.]+)$", maps, re.M)
-    memory = psutil.virtual_memory()
+    memory = psutil.virtual_memory().total
     governors = {_read(f) for f in _CPU.glob("cpu[0-9]*/cpufreq/scaling_governor")}
+    variables = os.environ | ONE_THREAD
     return {
         "machine": {
             "cpu": next(iter(_cpuinfo("model name")), None),
-            "physical_cores": psutil.cpu_count(logical=False),
-            "logical_cores": os.cpu_count(),
             "usable_cores": len(os.sched_getaffinity(0)),
             "cpu_limit": _cpu_limit(),
-            "memory_mib": memory.total >> 20,
-            "architecture": platform.machine(),
+            "memory_mib": memory >> 20,
             "system": platform.system(),
             "kernel": platform.release(),
-            "libc": " ".join(platform.libc_ver()).strip() or None,
-            "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
             "governor": ", ".join(sorted(governors - {""})) or None,
             "turbo": _turbo(),
             "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
@@ -94,47 +80,13 @@ def capture(
         | {name: _version(name) for name in (*PACKAGES, *packages)},
         "source": source(Path(__file__).resolve().parents[2]),
         "plugins": _plugins(map(PluginFile.of, plugins)),
-        "threads": {
-            "variables": {
-                k: os.environ[k] for k in THREAD_VARIABLES if k in os.environ
-            },
-            "pools": pools,
-        },
-        "cholmod": {
-            "version": cholmod[1] if cholmod else None,
-            "blas": cholmod_blas(pools, maps),
-        },
+        "threads": {k: variables[k] for k in THREAD_VARIABLES if k in variables},
+        "blas": dict(sorted(filter(None, map(_blas, threadpool_info())))),
         "now": {
             "time": datetime.now(UTC).isoformat(timespec="seconds"),
             "load": os.getloadavg()[0],
-            "available_memory_mib": memory.available >> 20,
         },
     }
-
-
-def capture_in_worker(
-    plugins: Iterable[str | Path | PluginFile] = (), packages: Iterable[str] = ()
-) -> dict[str, Any]:
-    """Describe the environment of a new process with one thread in every library.
-
-    A new process is needed, since libraries read their thread variables only when they
-    are loaded.
-    """
-    program = (
-        "import json, sys, mortarbench.harness.environment.environment as e; "
-        "plugins, packages = map(json.loads, sys.argv[1:]); "
-        "print(json.dumps(e.capture(plugins, packages)))"
-    )
-    arguments = ([*map(str, plugins)], [*packages])
-    process = subprocess.run(
-        [sys.executable, "-P", "-c", program, *map(json.dumps, arguments)],
-        env=os.environ | ONE_THREAD,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    environment: dict[str, Any] = json.loads(process.stdout)
-    return environment
 
 
 def packages_of(environment: Mapping[str, Any]) -> list[str]:
@@ -189,33 +141,18 @@ def source(root: Path) -> dict[str, Any] | None:
     return {"commit": commit, "dirty": True, "changes": hex_digest(changes)}
 
 
-def cholmod_blas(pools: Iterable[Mapping[str, Any]], maps: str) -> str | None:
-    """Return the BLAS that CHOLMOD uses, such as "libopenblas 0.3.21 pthreads".
+def _blas(info: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Return name and version of a BLAS in an entry of threadpoolctl, or None.
 
-    CHOLMOD calls the BLAS of the operating system or of its own wheel, not a BLAS in
-    the wheel of another package. The reference BLAS has no thread pool. A libblas
-    beside an optimised BLAS is a wrapper of the latter (alternatives of Debian).
-
-    pools : entries ``threads.pools`` of `capture`
-    maps : content of /proc/self/maps
+    None is returned for other libraries, and for those that a notebook or a plug-in
+    has loaded. The path of the library is replaced by its owner.
     """
-    for pool in pools:
-        if pool["owner"] in ("system", "scikit_sparse") and pool["layer"]:
-            return f"{pool['library']} {pool['version']} {pool['layer']}"
-    return REFERENCE_BLAS if re.search(r"/libblas[^/]*$", maps, re.M) else None
-
-
-def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an entry of threadpoolctl with the library's owner instead of its path."""
     bundled = re.search(r"/(\w+)\.libs/", info["filepath"])
-    return {
-        "library": info["prefix"],
-        "owner": bundled[1] if bundled else "system",
-        "version": info["version"],
-        "architecture": info.get("architecture"),
-        "layer": info.get("threading_layer"),
-        "threads": info["num_threads"],
-    }
+    owner = bundled[1] if bundled else "system"
+    if info["user_api"] != "blas" or owner not in OWNERS:
+        return None
+    parts = (info["version"], info.get("threading_layer"), info.get("architecture"))
+    return f"{info['prefix']} ({owner})", " ".join(filter(None, parts))
 
 
 def _version(package: str) -> str | None:

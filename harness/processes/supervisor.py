@@ -8,13 +8,12 @@ includes address space that libraries reserve and never touch. The module requir
 /proc file system of Linux.
 
 All workers of a process share one CPU. Requests from several threads are therefore
-serialised, and a worker that uses CPU time while it is idle is replaced, so that
+serialised, and a worker that still uses CPU time after its answer is replaced, so that
 running threads of one solver do not disturb the measurement of another solver.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
@@ -22,9 +21,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -59,20 +58,16 @@ POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
 CLOSE_SECONDS = 1.0
 #: longest time for which idle threads of pools may spin after an answer
 SETTLE_SECONDS = 0.5
-#: CPU time of a worker between an answer and the next request, relative to wall time,
-#: above which the worker counts as busy
-MAX_IDLE_CPU_SHARE = 0.5
 LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
 #: length to which the last line of the log is shortened in a message
 MAX_LAST_LINE_CHARACTERS = 300
 _LOG_TAIL_BYTES = 2**16  #: bytes at the end of the log in which its last line is sought
-_MIN_FD = 3  #: smallest descriptor of a pipe; smaller numbers are standard streams
 #: fraction of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
 
 _LOCK = ForkSafeLock()  #: held while a thread starts, ends or queries a worker
 
-REPLACEMENT_NOTE = "the worker used CPU time between measurements, and was replaced"
+REPLACEMENT_NOTE = "the worker used CPU time after its answer, and was replaced"
 
 #: Signals that solvers do not send to themselves. If such a signal ends a worker before
 #: a solve, the worker was killed from outside.
@@ -129,11 +124,6 @@ class WorkerProcess:
         self._unread = b""
         self._warms_up = True
         self._is_warm = False
-        # True between the steps of a sequence that several processes solve
-        self._keeps_ranks = False
-        self._was_busy = False  # True if the worker used CPU time while it was idle
-        # time on the parent's clock and CPU time of the worker at the last answer
-        self._idle_since = (0.0, 0.0)
         # number of threads and CPU that the worker reports after its warm-up
         self._facts: dict[str, Any] = {}
         self._peak_mib = 0.0
@@ -169,9 +159,6 @@ class WorkerProcess:
         memory_limit : limit for all processes of the worker together, in MiB
         """
         self._peak_mib, self._built = 0.0, None
-        for worker in tuple(self._all):
-            worker._end_if_busy(worker._has_been_busy)
-        was_busy, self._was_busy = self._was_busy, False
         while True:
             was_warm = self._is_warm
             try:
@@ -185,17 +172,14 @@ class WorkerProcess:
             except OSError as e:  # a process, pipe or log could not be created
                 self._kill()
                 return Reply(fault=True, message=one_line(str(e)))
-        self._keeps_ranks = "step" in request and source_of(request).is_shared
-        reply = self._reply(answer=answer, elapsed_seconds=elapsed)
-        if not self._keeps_ranks and self._has_children():
-            self._kill()  # remaining processes would disturb the next measurement
-        self._end_if_busy(self._stays_busy)
-        if self._is_warm:
-            self._idle_since = (time.monotonic(), self._cpu_seconds())
-        if was_busy or self._was_busy:
-            self._was_busy = False
-            return replace(reply, message=REPLACEMENT_NOTE)
-        return reply
+        # the ranks of a sequence remain between its steps
+        keeps_ranks = "step" in request and source_of(request).is_shared
+        is_busy = self._is_busy()
+        # processes that still run would disturb the next measurement
+        if is_busy or (not keeps_ranks and self._has_children()):
+            self._kill()
+        message = REPLACEMENT_NOTE if is_busy else ""
+        return self._reply(answer=answer, elapsed_seconds=elapsed, message=message)
 
     @_LOCK
     def close(self) -> None:
@@ -226,7 +210,7 @@ class WorkerProcess:
         """Send a request; return the answer, and the time to the event "timed"."""
         with suppress(OSError):
             self._log.write_bytes(b"")
-        oom_kills, sent, elapsed = _oom_kills(), time.monotonic(), None
+        sent, elapsed = time.monotonic(), None
         self._send(request)
         is_shared, is_timed = source_of(request).is_shared, "out" in request
         events = [
@@ -246,7 +230,6 @@ class WorkerProcess:
             # the memory of the evaluation does not count
             answer = self._await("done", limit, None if is_shared else memory_limit)
         except _WorkerEndError as end:
-            end.is_oom = end.signal == "SIGKILL" and _oom_kills() > oom_kills
             if is_shared:
                 stages = {"built": "build: ", "done": "evaluation of the answer: "}
                 end.stage = stages.get(end.event, "")
@@ -266,12 +249,10 @@ class WorkerProcess:
         is_fault = end.is_fault or (end.is_early and has_failed)
         if out_of_memory(message, peak, memory_limit):
             verdict, is_fault = Verdict.MEMORY_LIMIT, False
-        elif end.is_oom:
+        elif end.signal == "SIGKILL" and peak > limits.memory_limit_mib() / 2:
+            # the kernel has killed it
             message = f"{message}: the machine ran out of memory"
-            verdict = Verdict.MEMORY_LIMIT
-            # The process that the kernel kills need not be the cause. If the worker
-            # used less than half of the available memory, the end counts as a fault.
-            is_fault = peak < limits.memory_limit_mib() / 2
+            verdict, is_fault = Verdict.MEMORY_LIMIT, False
         return self._reply(
             verdict=None if is_fault else verdict,
             fault=is_fault,
@@ -286,11 +267,8 @@ class WorkerProcess:
     def _start(self, memory_limit: float) -> None:
         """Start the worker and run its warm-up, unless it is warm already.
 
-        If the solver causes the worker's death during the warm-up, the worker is
-        restarted without a warm-up. If the worker was killed from outside, the warm-up
-        is repeated once.
+        A worker that dies during the warm-up is restarted without a warm-up.
         """
-        is_first = True
         while not self._is_warm:
             if self._process is None:
                 self._spawn(memory_limit)
@@ -307,14 +285,13 @@ class WorkerProcess:
             except _WorkerEndError as end:
                 if end.is_fault:
                     raise
-                self._warms_up = end.signal in _EXTERNAL_SIGNALS and is_first
-                is_first = False
+                self._warms_up = False
                 self._kill()
 
     def _spawn(self, memory_limit: float) -> None:
         """Start the command below a small parent."""
-        requests, self._requests = _pipe()
-        self._replies, replies = _pipe()
+        requests, self._requests = os.pipe()
+        self._replies, replies = os.pipe()
         cpu = fastest_first(os.sched_getaffinity(0))[0]
         above = (sys.executable, "-I", "-S", parent.__file__)
         arguments = (os.getpid(), cpu, requests, replies)
@@ -430,43 +407,19 @@ class WorkerProcess:
                     return True
         return False
 
-    def _end_if_busy(self, is_busy: Callable[[], bool]) -> None:
-        """Kill the idle worker if it has died, or uses CPU time."""
-        if self._is_warm:
-            self._was_busy |= is_busy()
-            if self._was_busy or self._is_dead():
-                self._kill()
-
-    def _cpu_seconds(self) -> float:
-        """Return the CPU time of all threads of the worker; 0 if it has ended."""
-        with suppress(psutil.Error):
-            return float(sum(self._worker.cpu_times()[:2]))
-        return 0.0
-
-    def _has_been_busy(self) -> bool:
-        since, used = self._idle_since
-        # the kernel reports multiples of 0.01 s
-        elapsed = time.monotonic() - since + 2 * POLL_SECONDS
-        return self._cpu_seconds() - used > MAX_IDLE_CPU_SHARE * elapsed
-
-    def _stays_busy(self) -> bool:
+    def _is_busy(self) -> bool:
         """Return True if threads of the idle worker continue to compute.
 
         Threads of pools may spin before they sleep, for at most `SETTLE_SECONDS`.
         """
-        deadline, pause = time.monotonic() + SETTLE_SECONDS, POLL_SECONDS / 100
-        while self._runs():
-            if time.monotonic() > deadline:
-                return True
-            time.sleep(pause)
-            pause = min(2 * pause, POLL_SECONDS)
-        return False
-
-    def _runs(self) -> bool:
-        """Return True if a thread of the worker runs, or waits for a CPU."""
+        deadline = time.monotonic() + SETTLE_SECONDS
         with suppress(psutil.Error):
-            threads = [t.id for t in self._worker.threads()]
-            return "running" in [psutil.Process(t).status() for t in threads]
+            while "running" in [
+                psutil.Process(thread.id).status() for thread in self._worker.threads()
+            ]:
+                if time.monotonic() > deadline:
+                    return True
+                time.sleep(POLL_SECONDS / 40)
         return False
 
     def _death(self) -> tuple[str, str]:
@@ -505,7 +458,7 @@ class WorkerProcess:
         self._process = self._worker = None
         self._requests = self._replies = -1
         self._unread = b""
-        self._is_warm = self._keeps_ranks = False
+        self._is_warm = False
 
 
 os.register_at_fork(after_in_child=WorkerProcess.forget_all)
@@ -520,7 +473,6 @@ class _WorkerEndError(Exception):
     message: str  #: description of the end
     signal: str = ""  #: name of the signal that ended the worker; else empty
     is_fault: bool = False  #: True if the worker reported a fault of the harness
-    is_oom: bool = False  #: True if the kernel killed the worker for lack of memory
     stage: str = ""  #: prefix of the message
 
     @property
@@ -546,28 +498,6 @@ def _memory_mib(tree: list[int], limit: float) -> float:
         with suppress(psutil.Error):
             proportional += psutil.Process(number).memory_full_info().pss
     return proportional / 2**20
-
-
-def _pipe() -> tuple[int, int]:
-    """Open a pipe whose descriptors do not collide with the standard streams.
-
-    If the calling program has closed a standard stream, pipe(2) may return the number
-    of this stream, and the standard streams of the worker would replace the pipe.
-    """
-    ends = os.pipe()
-    read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _MIN_FD) for e in ends)
-    for end in ends:
-        os.close(end)
-    return read, write
-
-
-def _oom_kills() -> int:
-    """Return the number of processes that the kernel has killed for lack of memory."""
-    with suppress(OSError), open("/proc/vmstat") as lines:
-        for line in lines:
-            if line.startswith("oom_kill "):
-                return int(line.split()[1])
-    return 0
 
 
 _ALLOCATION_FAILURE = re.compile(

@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from threading import Lock
@@ -24,7 +24,7 @@ from typing import Any
 from mortarbench.harness.checked import located
 from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.environment.environment import (
-    capture_in_worker,
+    capture,
     digest,
     packages_of,
 )
@@ -190,7 +190,7 @@ def measure(
     from distributed import get_worker
 
     worker, node = get_worker(), platform.node()
-    environment = _environment(digest(here), plugins, tuple(packages_of(here)))
+    environment = capture(plugins, packages_of(here))
     refuse_other_code(node, here, environment)
     for file in plugins:
         operators = merged("operator", operators, load_plugin(file).operators)
@@ -225,11 +225,3 @@ def refuse_other_code(
             f"{node} runs different code from this machine "
             f"({in_words(code, 'here', 'there')}); install the same code on every node"
         )
-
-
-@lru_cache(maxsize=1)
-def _environment(
-    here: str, plugins: tuple[PluginFile, ...], packages: tuple[str, ...]
-) -> dict[str, Any]:
-    """Return the environment of this node, captured once for each parent's."""
-    return capture_in_worker(plugins, packages)

@@ -12,8 +12,6 @@ def doctor(registries: Registries, *, json: bool = False) -> int:
 
     json : print JSON
     """
-    from rich.console import Console
-
     from mortarbench.harness.environment.doctor import advice, render
     from mortarbench.harness.environment.environment import digest
 
@@ -23,6 +21,5 @@ def doctor(registries: Registries, *, json: bool = False) -> int:
         data = {"digest": digest(environment), "fit": not changes, "advice": changes}
         print(dumps(data | {"environment": environment}))
     else:
-        text = render(environment, digest(environment))
-        Console(highlight=False, soft_wrap=True).print(text)
+        print(render(environment, digest(environment)))
     return 0

@@ -143,15 +143,15 @@ def test_differences_of_the_environment_are_named(cli, stored, tmp_path):
     path = tmp_path / "done" / "environment.json"
     environment = json.loads(path.read_text())
     environment["versions"]["numpy"] = "1.2.3"
-    environment["threads"]["pools"][0]["threads"] = 7
+    environment["threads"]["OMP_NUM_THREADS"] = "7"
     path.write_text(json.dumps(environment))
     code, out, _ = cli("replay", "done", stored["exact", 1, 0].run_id)
     told = [line.split() for line in out.splitlines()]
 
     assert code == 0
     assert ["versions.numpy", "1.2.3"] in [words[:2] for words in told]
-    assert "threads.pools" in [words[0] for words in told if words]
-    assert "threads.variables" not in out
+    assert "threads.OMP_NUM_THREADS" in [words[0] for words in told if words]
+    assert "threads.MKL_NUM_THREADS" not in out
 
 
 def test_an_unknown_run_id_is_reported_with_the_most_similar_one(cli, stored):
