@@ -13,7 +13,6 @@ that contains several, counted from 1.
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 from collections.abc import Mapping
@@ -32,9 +31,6 @@ from mortarbench.harness.errors import (
 from mortarbench.harness.keys import Value, keys_of
 from mortarbench.harness.plugin import Case, Family, Reference
 
-_FILE = re.compile(
-    r"[^=:]*\.[A-Za-z]\w*(/|$)"
-)  #: pattern of a text that begins with the path of a file with a suffix
 _ROW = re.compile(r"(.+)#([1-9][0-9]{0,8})", re.DOTALL)
 
 
@@ -136,28 +132,8 @@ def family_name(text: str, families: Mapping[str, Family]) -> str:
         )
     head = re.split("[:/]", text, maxsplit=1)[0]
     if head not in families:
-        if (named := _as_file(text, families)) is not None:
-            raise InputError(
-                f"unknown family {shown(head)}; did you mean {shown(named)}, a file?"
-            )
         raise unknown("family", head, families, more=PLUGINS)
     return head
-
-
-def _as_file(text: str, families: Mapping[str, Family]) -> str | None:
-    """Return the case name for a bare path; None if no family reads such a path."""
-    if not _FILE.match(text) and not (text and os.path.isfile(text)):
-        return None
-    suffixes = {
-        name: f.path_suffix for name, f in families.items() if f.path_suffix is not None
-    }
-    for name, suffix in sorted(suffixes.items(), key=lambda item: -len(item[1])):
-        if suffix and (end := f"{text}/".find(f"{suffix}/")) >= 0:
-            path, rest = text[: end + len(suffix)], text[end + len(suffix) :]
-            return f"{name}:{path}{rest or f'/{families[name].forms[0]}'}"
-        if not suffix:
-            return f"{name}:{text}"
-    return None
 
 
 def assemble(

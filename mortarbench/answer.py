@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from mortarbench.case import Case, as_case
 from mortarbench.harness import Record, Solver, Verdict, checked
-from mortarbench.harness.distributed.mpi import ranks_asked, too_few_parts
+from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.names import assemble, family_name
 from mortarbench.harness.processes.scratch import single_worker
@@ -313,21 +313,13 @@ def solve(
         name = type(solver).__name__
         solvers = {name: solver}
     spec = SolverSpec(name=name, label=name, options=requested).on(ranks)
-    parts = ranks
-    if ranks > 1:
-        named = as_case(case, registries=registries).id
-        divided = named.family.divided(named.form)
-        parts = 1 if divided is None else divided.subdomains
     with ExitStack() as stack:
-        worker = None
-        if parts >= ranks:
-            command = partial(registries.worker_command, spec, records=True)
-            is_object = not isinstance(solver, str)
-            copied = (
-                resolve(with_history(spec, solvers), solvers) if is_object else None
-            )
-            # The worker imports its libraries while this process imports its own.
-            worker = stack.enter_context(single_worker(command, copied))
+        command = partial(registries.worker_command, spec, records=True)
+        copied = None
+        if not isinstance(solver, str):
+            copied = resolve(with_history(spec, solvers), solvers)
+        # The worker imports its libraries while this process imports its own.
+        worker = stack.enter_context(single_worker(command, copied))
         defer_parts_of_numpy()
         problem = as_case(case, registries=registries)
 
@@ -343,13 +335,7 @@ def solve(
             repeat=0,
             environment=digest(registries.environment()),
         )
-        solution: Solution | None = None
-        notes: tuple[str, ...] = ()
-        if worker is None:
-            message = too_few_parts(parts, ranks)
-            record = record.replace(status=Verdict.DECLINED, message=message)
-        else:
-            record, solution, notes = _measured(worker, problem, record, time_limit)
+        record, solution, notes = _measured(worker, problem, record, time_limit)
     return Answer(
         case=problem,
         record=record,
@@ -365,18 +351,14 @@ def _measured(
 ) -> tuple[Record, Solution | None, tuple[str, ...]]:
     """Measure once; return the record, the answer, and remarks."""
     from mortarbench.harness.processes.measurement import measure_once
-    from mortarbench.harness.processes.protocol import Source
     from mortarbench.verification import remarks
 
-    own = problem.registries.hold_only_builtins()
     # Code of a family may print, and standard output is reserved for the answer
     with one_thread(), redirect_stdout(stderr):
         record, solution = measure_once(
             worker,
             lambda: problem.family_case,
             record,
-            problem.registries.reference,
-            source=Source.of(record, own_code_only=own),
             time_limit=time_limit,
         )
         # remarks on the input are known only if this process has built the case

@@ -238,9 +238,9 @@ def as_case(
         registries = load_registries(plugins, registries)
         return Case(id=parse(problem, registries.families), registries=registries)
     if isinstance(problem, Case):
-        if not (files := problem.registries.missing(plugins)):
+        registries = problem.registries.with_files(plugins)
+        if registries is problem.registries:
             return problem
-        registries = problem.registries.with_files(files)
         extended = Case(id=problem.id, registries=registries)
         if "family_case" in vars(problem):
             extended.__dict__["family_case"] = problem.family_case

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from html import escape
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -36,14 +35,6 @@ class Listing(tuple[Mapping[str, Any], ...]):
 
     def __repr__(self) -> str:
         return listing(self) if self else "none"
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td><code>{escape(row['name'])}</code></td>"
-            f"<td style='text-align:left'>{escape(row['description'])}</td></tr>"
-            for row in self
-        )
-        return f"<table><tr><th>name</th><th>description</th></tr>{rows}</table>"
 
 
 def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> Listing:

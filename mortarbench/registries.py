@@ -19,7 +19,6 @@ from mortarbench.harness.registry import (
     Plugin,
     PluginFile,
     SolverSpec,
-    entry_points_of,
     load_plugin,
     merged,
     options_of,
@@ -149,7 +148,7 @@ class Registries:
 
     @TURN
     def with_files(self, files: Plugins) -> Registries:
-        """Return registries extended by the plug-ins in `files`.
+        """Return registries extended by the plug-ins in `files` that are not loaded.
 
         Raises
         ------
@@ -158,35 +157,15 @@ class Registries:
 
         """
         extended = self
+        loaded = {file.resolved() for file in self.files}
         for file in _plugin_files(files):
+            if file.resolved() in loaded:
+                continue
             plugin = load_plugin(file)
             with checked.located(f"{file.path}"):
                 extended = extended.extended(plugin)
             extended = replace(extended, files=(*extended.files, file))
         return extended
-
-    def missing(self, files: Plugins) -> list[PluginFile]:
-        """Return the plug-ins in `files` that are not loaded yet.
-
-        Raises
-        ------
-        InputError
-            If `files` is not a list of files.
-
-        """
-        loaded = {file.resolved() for file in self.files}
-        return [f for f in _plugin_files(files) if f.resolved() not in loaded]
-
-    def hold_only_builtins(self) -> bool:
-        """Return True if no plug-in has been loaded."""
-        return (
-            self.families is PROBLEMS
-            and self.solvers is SOLVERS
-            and self.operators is OPERATORS
-            and not self.files
-            and not entry_points_of("mortarbench.problems")
-            and not entry_points_of("mortarbench.solvers")
-        )
 
     def worker_command(
         self, spec: SolverSpec, copy: Path | None = None, *, records: bool = False
@@ -228,7 +207,6 @@ class Registries:
         return Commands(
             solvers={s.label: self.worker_command(s) for s in specs},
             case_worker=[*self.start, "worker", json.dumps(request)],
-            own_code_only=self.hold_only_builtins(),
         )
 
     def environment(self) -> dict[str, Any]:
@@ -257,16 +235,12 @@ class Registries:
 
         """
         path = checked.path("suite", text)
-        if path.is_file():
+        if path.is_file() or path.suffix or len(path.parts) > 1:
             return path
         suites = {p.stem: p for p in self.suites.glob("*.toml")}
-        if str(text) in suites:
-            return suites[str(text)]
-        if path.exists():
-            return path  # not a regular file; the reader raises the appropriate error
-        if len(path.parts) > 1 or path.suffix:
-            raise InputError(f"{text}: no such file; expected a suite in TOML")
-        raise unknown("suite", str(text), suites)
+        if str(text) not in suites:
+            raise unknown("suite", str(text), suites)
+        return suites[str(text)]
 
 
 def with_history(spec: SolverSpec, solvers: Mapping[str, Solver]) -> SolverSpec:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,13 +56,6 @@ class Report:
 
     def __repr__(self) -> str:
         return "\n".join([*self.said, str(self.page or f"{len(self.files)} files")])
-
-    def _repr_html_(self) -> str:
-        lines = "".join(f"<p>{escape(line)}</p>" for line in self.said)
-        if self.page is None:
-            return f"{lines}<p>{len(self.files)} files</p>"
-        page = escape(str(self.page), quote=True)
-        return f"{lines}<p><a href='{page}'>{page}</a></p>"
 
 
 def report(

@@ -6,7 +6,6 @@ import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness.record import Record, Verdict, in_space
@@ -49,31 +48,14 @@ _CONTACT_UNITS = {
 }
 
 
-#: heading and meaning of the columns of a history, by name
+#: headings of the columns of a history, see `harness.solution`
 _COLUMNS = {
-    "step": (
-        "step",
-        "c conjugate gradients, e expansion, f fallback, p proportioning, n Newton",
-    ),
-    "outer": ("outer", "number of the outer iteration"),
-    "products": ("products", "number of products with the QP's matrix P so far"),
-    "free_gradient": ("‖φ‖", "free gradient (norm), of the variables not at a bound"),
-    "chopped_gradient": (
-        "‖β‖",
-        "chopped gradient (norm), of the variables that should leave their bounds",
-    ),
-    "infeasibility": ("‖Ax−b‖", "relative violation of the equality rows"),
-    "active": ("at bound", "number of variables at one of their bounds"),
-    "two_sided": (
-        "of two",
-        "number of variables at a bound that have two bounds; with friction, number of "
-        "rows that slip",
-    ),
-    "cost": (
-        "own cost",
-        "function that the solver itself minimises, in its own scaling; neither a "
-        "time nor the objective above",
-    ),
+    "free_gradient": "‖φ‖",
+    "chopped_gradient": "‖β‖",
+    "infeasibility": "‖Ax−b‖",
+    "active": "at bound",
+    "two_sided": "of two",
+    "cost": "own cost",
 }
 #: columns of a history that are not shown, because times of single runs are unreliable
 _HIDDEN = ("seconds",)
@@ -253,16 +235,8 @@ def convergence(history: History) -> str:
             if values.dtype.kind == "U"
             else [_entry(name, values[end].item()) for end in ends]
         )
-        head, _ = _COLUMNS.get(name, (name.replace("_", " "), ""))
-        cells.append([head, *texts])
+        cells.append([_COLUMNS.get(name, name.replace("_", " ")), *texts])
     return align(zip(*cells, strict=True), right=range(len(cells)))
-
-
-def legend(history: History) -> str:
-    """Return the legend of `convergence`: the explanations of its columns."""
-    columns = (v for k, v in _COLUMNS.items() if k in history and history[k].size)
-    lines = (f"{head}: {meaning}" for head, meaning in columns)
-    return "\n".join(fill(line, 80, subsequent_indent="  ") for line in lines)
 
 
 def _milestones(history: History) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import inf
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 TIME_LIMIT = 10.0  #: time limit for each check of the conformance suite, in s
 MEMORY_LIMIT = 4096.0  #: memory limit for each check, in MiB
 _MAX_ROWS = 12  #: largest number of rows of a table on the terminal
-_EQUAL_FAILURES = 3  #: smallest number of checks with equal failures that are one line
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -166,20 +165,8 @@ class Conformance:
 
         grades = Counter(r.grade for r in self.results.values())
         counts = ", ".join(f"{grades[g]} {g}" for g in Grade)
-        return f"{align(self._rows())}\n{self.solver}: {counts}"
-
-    def _rows(self) -> Iterator[tuple[str, str, str]]:
-        """Yield grade, name and message of the checks; equal failures are one row."""
-        equal = Counter((r.grade, r.message) for r in self.results.values())
-        seen = set()
-        for name, r in self.results.items():
-            message, count = r.message, equal[r.grade, r.message]
-            if r.grade in ("weak", "fail") and count >= _EQUAL_FAILURES:
-                if (r.grade, r.message) in seen:
-                    continue
-                seen.add((r.grade, r.message))
-                message += f" (the same in {count} checks)"
-            yield r.grade, name, message
+        rows = [(r.grade, name, r.message) for name, r in self.results.items()]
+        return f"{align(rows)}\n{self.solver}: {counts}"
 
 
 def test_solver(

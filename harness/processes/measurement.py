@@ -14,8 +14,7 @@ from mortarbench.harness.errors import FaultError, InputError
 from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.files.store import read_point
-from mortarbench.harness.plugin import Case, Reference
-from mortarbench.harness.processes.protocol import Source
+from mortarbench.harness.plugin import Case
 from mortarbench.harness.processes.scratch import scratch_folder
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
@@ -41,7 +40,6 @@ def measure_and_judge(
     record: Record,
     *,
     out: Path,
-    source: Source = Source.FILE,
     qp_file: tuple[Path, str] | None = None,
     time_limit: float,
     memory_limit: float = inf,
@@ -52,11 +50,10 @@ def measure_and_judge(
     If the worker ends in a repetition of a completed solve, the QP is solved and timed
     once in a new worker.
 
-    whole : returns the QP; called if `Source.needs_case`
+    whole : returns the QP; not called if ranks build the QP
     out : file to which the worker writes the point
-    source : origin of the QP. Unless `Source.needs_case`, the worker judges the answer,
-        and computes its quantities and error bounds
-    qp_file : file with the QP, and digest of its content; None if ranks build the QP
+    qp_file : file with the QP, and digest of its content; None if ranks build the QP,
+        judge the answer, and compute its quantities and error bounds
     time_limit, memory_limit : limits in s and MiB
     entries : further entries of the request, see `harness.processes.worker`
 
@@ -72,10 +69,9 @@ def measure_and_judge(
         lost.
 
     """
-    request = {"out": str(out), "source": source, "tol": record.tol, **entries}
-    request["judged_at"] = record.judged_at
+    request = {"out": str(out), "tol": record.tol, **entries}
     if qp_file is None:
-        request["case"] = case_entry(record)
+        request |= {"case": case_entry(record), "judged_at": record.judged_at}
     else:
         request |= {"qp": str(qp_file[0]), "digest": qp_file[1]}
     if not isinf(memory_limit):
@@ -97,7 +93,7 @@ def measure_and_judge(
             threads=reply.threads,
             cpu=reply.cpu,
         )
-        if source.needs_case:
+        if qp_file is not None:
             qp = whole()
             record = record.replace(sizes=qp.sizes)
         elif reply.built is not None:
@@ -107,9 +103,9 @@ def measure_and_judge(
         solution = _solution(out, reply.answer)
     except (InputError, OSError) as e:  # a file is damaged, or the disk is full
         raise FaultError(f"{record.solver} on {record.case}: {e}") from None
-    cost, more = _cost(reply, source)
+    cost, more = _cost(reply)
     record = record.replace(**cost)
-    if source.needs_case:
+    if qp_file is not None:
         record = judged(record, qp, solution)
     else:
         fields = dict(reply.answer["fields"])
@@ -134,7 +130,7 @@ def case_entry(r: Record) -> dict[str, Any]:
     return {"family": r.family, "params": r.params, "form": r.form, "name": r.case}
 
 
-def _cost(reply: Reply, source: Source) -> tuple[dict[str, Any], list[str]]:
+def _cost(reply: Reply) -> tuple[dict[str, Any], list[str]]:
     """Return the cost of a measurement as fields of its record, and notes.
 
     Times that exceed the time on the parent's clock are replaced by the latter.
@@ -151,7 +147,9 @@ def _cost(reply: Reply, source: Source) -> tuple[dict[str, Any], list[str]]:
         )
     if cost.get("remembered"):
         notes.append(REMEMBERED_NOTE)
-    if source.is_shared:  # the worker measures only the memory of its own process
+    if (
+        reply.built is not None
+    ):  # the worker measures only the memory of its own process
         cost["peak_mib"] = reply.peak_mib
     return cost, notes
 
@@ -177,17 +175,12 @@ def measure_once(
     worker: WorkerProcess,
     case: Callable[[], Case],
     record: Record,
-    reference: Reference,
     *,
-    source: Source = Source.FILE,
     time_limit: float = inf,
 ) -> tuple[Record, Solution | None]:
     """Measure once, judge the answer, and compute quantities and bounds.
 
-    case : returns the case; the first call builds it
-    reference : reference solver, called if the residuals alone do not decide the
-        verdict
-    source : origin of the QP; the case is not built unless `Source.needs_case`
+    case : returns the case; the first call builds it. Not called if ranks build it
     time_limit : limit of the solve, in s
 
     Raises
@@ -198,10 +191,9 @@ def measure_once(
     """
     with scratch_folder() as scratch:
         path, qp_file = scratch / "qp.npz", None
-        if source.needs_case:
+        if record.ranks == 1:
             saved = save_qp(path, case().qp, {"name": record.case}, serialised=True)
             record = record.replace(qp=case().digest or saved)
-        if not source.is_shared:
             qp_file = path, content_digest(path)
         once = partial(
             measure_and_judge,
@@ -209,7 +201,6 @@ def measure_once(
             lambda: case().qp,
             record,
             out=scratch / "point.npz",
-            source=source,
             qp_file=qp_file,
             time_limit=time_limit,
         )
@@ -218,7 +209,7 @@ def measure_once(
         except FaultError:
             record, solution = once()
     declined = record.status is Verdict.DECLINED
-    if solution is None or declined or not source.needs_case:
+    if solution is None or declined or record.ranks > 1:
         return record, solution
     results, notes = results_of(case(), solution)
     return noted(record.replace(**results), *notes), solution

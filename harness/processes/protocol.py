@@ -26,11 +26,10 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from enum import StrEnum
 from typing import Any
 
 from mortarbench.harness.errors import described, one_line, shortened
-from mortarbench.harness.record import Record, finite
+from mortarbench.harness.record import finite
 
 #: size of the largest reply that is read, which bounds the required memory
 MAX_REPLY_BYTES = 2**22
@@ -95,40 +94,3 @@ def event_of(line: bytes, expected: str) -> dict[str, Any]:
     raise ForeignReplyError(
         f"{shortened(text, MAX_EXCERPT_CHARACTERS)} was received, expected {expected!r}"
     )
-
-
-class Source(StrEnum):
-    """Origin of the QP of a measurement, which determines who judges the answer."""
-
-    #: The worker and the parent read the QP from a file; the parent judges the answer
-    FILE = "file"
-    #: MPI ranks build the QP together. The parent builds it as well and judges the
-    #: answer
-    SHARES = "shares"
-    #: MPI ranks build the QP together, and rank 0 judges the answer
-    RANKS = "ranks"
-
-    @classmethod
-    def of(cls, record: Record, *, own_code_only: bool) -> Source:
-        """Return the origin of the QP of a record.
-
-        own_code_only : False if code of plug-ins may run on the ranks
-        """
-        if record.ranks == 1:
-            return cls.FILE
-        return cls.RANKS if own_code_only else cls.SHARES
-
-    @property
-    def is_shared(self) -> bool:
-        """True if MPI ranks build the QP."""
-        return self is not Source.FILE
-
-    @property
-    def needs_case(self) -> bool:
-        """True if the parent builds the case and judges the answer."""
-        return self is not Source.RANKS
-
-
-def source_of(request: Mapping[str, Any]) -> Source:
-    """Return the origin of the QP of a request."""
-    return Source(request.get("source", Source.FILE))

@@ -42,7 +42,6 @@ from mortarbench.harness.processes.protocol import (
     MAX_REPLY_BYTES,
     ForeignReplyError,
     event_of,
-    source_of,
 )
 from mortarbench.harness.record import Verdict
 
@@ -173,7 +172,7 @@ class WorkerProcess:
                 self._kill()
                 return Reply(fault=True, message=one_line(str(e)))
         # the ranks of a sequence remain between its steps
-        keeps_ranks = "step" in request and source_of(request).is_shared
+        keeps_ranks = "step" in request and "case" in request
         is_busy = self._is_busy()
         # processes that still run would disturb the next measurement
         if is_busy or (not keeps_ranks and self._has_children()):
@@ -212,7 +211,7 @@ class WorkerProcess:
             self._log.write_bytes(b"")
         sent, elapsed = time.monotonic(), None
         self._send(request)
-        is_shared, is_timed = source_of(request).is_shared, "out" in request
+        is_shared, is_timed = "case" in request, "out" in request
         events = [
             *[("built", time_limit)] * is_shared,
             ("start", START_SECONDS),

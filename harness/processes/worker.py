@@ -10,9 +10,9 @@ The process follows `harness.processes.protocol` and answers these requests:
   - ``once``: true for a single solve, which is timed, and
   - ``step``: index 0, 1, … of the QP in a sequence
 
-* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: build a case on the MPI ranks
-  (`harness.plugin.Family.divided`), measure, and write the point to ``out``. If
-  ``source`` is "ranks", the ranks also judge the answer at the tolerance ``judged_at``.
+* ``{"case": {…}, "tol": TOL, "judged_at": TOL, "out": PATH}``: build a case on the MPI
+  ranks (`harness.plugin.Family.divided`), measure, write the point to ``out``, and
+  judge the answer at the tolerance ``judged_at``.
   The event ``built`` contains the fields ``sizes``, ``qp`` and ``build_seconds`` of
   the record; the event ``measured`` is sent when the point has been written
 * ``{"build": …}`` and ``{"describe": …}``: see `harness.processes.cases`
@@ -48,9 +48,7 @@ from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.cases import Cases
 from mortarbench.harness.processes.protocol import (
     Send,
-    Source,
     answer_requests,
-    source_of,
 )
 from mortarbench.harness.processes.ranks import Build, Ranks
 from mortarbench.harness.qp import QP, no_rows
@@ -191,9 +189,8 @@ class Worker:
         write_point(Path(request["out"]), s)
         if ranks is not None:
             send("measured")
-            if source_of(request) is Source.RANKS:
-                fields, notes = ranks.judge(s, request["judged_at"])
-                judged = {"fields": fields, "notes": [*filter(None, notes)]}
+            fields, notes = ranks.judge(s, request["judged_at"])
+            judged = {"fields": fields, "notes": [*filter(None, notes)]}
         return {
             **judged,
             "claimed": s.status,

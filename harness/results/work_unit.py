@@ -23,9 +23,6 @@ class Commands:
     #: commands that run `harness.processes.worker`, by label of the solver
     solvers: Mapping[str, list[str]]
     case_worker: list[str]  #: command that runs `harness.processes.case_worker`
-    #: True if solver processes run no plug-in code; verdicts on distributed
-    #: QPs may then be computed in these processes
-    own_code_only: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

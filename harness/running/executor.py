@@ -16,7 +16,6 @@ from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.processes.measurement import case_entry, measure_and_judge
-from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
@@ -127,10 +126,10 @@ class Executor:
             If the harness or the machine failed.
 
         """
-        source = Source.of(turn[0], own_code_only=self.commands.own_code_only)
-        if source.needs_case:
+        is_shared = turn[0].ranks > 1
+        if not is_shared:
             self._build(turn)
-        count = len(self._entries) if source.needs_case else len(turn)
+        count = len(turn) if is_shared else len(self._entries)
         ended: Record | None = None
         for step, record in enumerate(turn):
             reason = ""
@@ -142,33 +141,29 @@ class Executor:
             if reason:
                 yield Result(record=record.replace(status=status, message=reason))
                 continue
-            result = self._measure(block, turn, step, source)
+            result = self._measure(block, turn, step)
             # a failed step loses the solver's data for later steps
             failed = result.record.status is not Verdict.DECLINED
             if block.is_sequence and result.point is None and failed:
                 ended = result.record
             yield result
-        if block.is_sequence and source.is_shared:
+        if block.is_sequence and is_shared:
             self._worker(turn[0].solver).close()  # it remains between steps only
 
-    def _measure(
-        self, block: WorkUnit, turn: tuple[Record, ...], step: int, source: Source
-    ) -> Result:
+    def _measure(self, block: WorkUnit, turn: tuple[Record, ...], step: int) -> Result:
         """Measure one solver on one case, and evaluate its answer."""
         record, qp_file = turn[step], None
         entries: dict[str, Any] = {"step": step} if block.is_sequence else {}
         if len(turn) > 1:  # steps, whose times must not depend on the reuse of results
             entries["once"] = True
-        if source.needs_case:
+        if record.ranks == 1:
             built = self._entries[step]
-            record = record.replace(**built.meta)
-            qp_file = None if source.is_shared else built.file
+            record, qp_file = record.replace(**built.meta), built.file
         record, solution = measure_and_judge(
             self._worker(record.solver),
             lambda: self._entries[step].qp,
             record,
             out=self._point,
-            source=source,
             qp_file=qp_file,
             time_limit=block.time_limit,
             memory_limit=block.memory_limit,
@@ -178,7 +173,7 @@ class Executor:
             refuse_full_disk(self.scratch, "")  # a full disk may be the cause
         if solution is None or not has_point(solution):
             return Result(record=record)
-        if source.needs_case:
+        if record.ranks == 1:
             return self._describe(record, solution)
         return Result(record=record, point=point_arrays(solution))
 

@@ -16,7 +16,7 @@ from mortarbench.harness.registry import check_name
 from mortarbench.harness.suite.solver_options import parse_options
 from mortarbench.progress import waiting
 from mortarbench.registries import Registries
-from mortarbench.text import convergence, legend
+from mortarbench.text import convergence
 
 if TYPE_CHECKING:
     from mortarbench.answer import Answer
@@ -97,7 +97,7 @@ def _print(answer: Answer, json: bool) -> None:
     if json:
         print(dumps(answer.to_dict(), allow_nan=False))
     elif not declined:
-        texts = (str(answer), convergence(answer.history), legend(answer.history))
+        texts = (str(answer), convergence(answer.history))
         print(*filter(None, texts), sep="\n\n")
     if declined:
         say(f"{record.solver} declines {record.case}: {record.message}{_hint(answer)}")

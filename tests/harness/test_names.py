@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mortarbench.harness import DERIVED, Family, InputError, Range
+from mortarbench.harness import DERIVED, Family, Range
 from mortarbench.harness.names import CaseId, assemble, parse
 from tests.support.refusals import refused
 
@@ -132,41 +132,3 @@ def test_a_canonical_name_parses_to_the_case_that_it_names(form, **params):
 def test_an_invalid_name_is_reported_in_one_line(text, message):
     with refused(start=message):
         parse(text, FAMILIES)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stored(Named):
-    forms: ClassVar = ("qp",)
-    path_suffix: ClassVar = ""
-
-    path: str = ""
-    n: int = 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class Meshed(Stored):
-    path_suffix: ClassVar = ".toml"
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("qp.npz", "file:qp.npz"),
-        ("folder/my.qps.gz", "file:folder/my.qps.gz"),
-        ("/a/b.mat", "file:/a/b.mat"),
-        ("there", "file:there"),
-        ("two/bodies.toml", "meshed:two/bodies.toml/qp"),
-        ("two/bodies.toml/n=3/dual", "meshed:two/bodies.toml/n=3/dual"),
-    ],
-)
-def test_the_error_for_a_path_names_the_case_of_the_file(
-    tmp_path, monkeypatch, text, named
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "there").write_text("")
-    families = {"file": Stored(), "meshed": Meshed()}
-
-    with pytest.raises(InputError) as e:
-        parse(text, families)
-    head = text.partition("/")[0]
-    assert str(e.value) == f"unknown family {head!r}; did you mean {named!r}, a file?"

@@ -162,7 +162,7 @@ def test_numbers_that_are_not_finite_are_null_in_json(cli):
 def test_solve_prints_counters_and_a_table_of_convergence(cli):
     _, out, _ = cli("solve", "well/dual", "--solver", "descent")
 
-    facts, table, legend = out.split("\n\n")
+    facts, table = out.split("\n\n")
     assert "counts P_products 2 prepare" in " ".join(facts.split())
     head, *rows = (line.split() for line in table.splitlines())
     assert " ".join(head) == "iteration step products ‖φ‖ ‖β‖ at bound own cost"
@@ -170,10 +170,6 @@ def test_solve_prints_counters_and_a_table_of_convergence(cli):
         ["1", "e1", "1", "0", "1.73e+00", "3", "0"],
         ["2", "e1", "2", "0", "0", "0", "-1.5"],
     ]
-    for word in ("e expansion", "‖φ‖: free", "‖β‖: chopped", "at bound:", "own cost:"):
-        assert word in legend
-    assert "function that the solver itself minimises" in legend
-    assert max(map(len, legend.splitlines())) <= 80
 
 
 def test_long_tables_keep_their_first_and_last_row_and_count_every_step():

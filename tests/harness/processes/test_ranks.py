@@ -10,7 +10,6 @@ from mortarbench.harness.distributed import mpi
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.store import load_solution
 from mortarbench.harness.solution import Status
-from mortarbench.registries import Registries
 from tests.support.hexahedra import TETRAHEDRA
 from tests.support.solid_blocks import TOML, solid_blocks
 
@@ -116,14 +115,13 @@ SOLVERS = {"mine": Mine(), "liar": Liar()}
 """
 
 
-def test_the_parent_judges_a_plug_in_on_ranks(tmp_path):
+def test_a_false_claim_of_a_plug_in_on_ranks_is_refuted(tmp_path):
     (tmp_path / "mine.py").write_text(FILE)
     answer = mb.solve(
         MEMBRANES, "liar", tol=1e-6, ranks=2, plugins=[tmp_path / "mine.py"]
     )
     assert (answer.record.claimed, answer.verdict) == ("solved", "wrong")
     assert answer.record.reported["ranks"] == 2
-    # the parent has built the QP, to which the answer of the ranks belongs
     assert answer.record.qp == mb.solve(MEMBRANES, "smalbe", tol=1e-6).record.qp
 
 
@@ -134,10 +132,7 @@ def test_the_parent_judges_a_plug_in_on_ranks(tmp_path):
         ("beam-ring/Nr=2/Nh=2/steps=1/dual", "the case is not in subdomains; expected"),
     ],
 )
-def test_cases_that_ranks_cannot_divide_are_declined_before_any_rank_starts(
-    name, message, monkeypatch
-):
-    monkeypatch.setattr(Registries, "worker_command", lambda *_: ["false"])
+def test_cases_that_ranks_cannot_divide_are_declined(name, message):
     answer = mb.solve(name, "smalbe", ranks=3)
     assert answer.verdict == "declined"
     assert answer.record.message.startswith(message)
@@ -223,7 +218,7 @@ def test_the_same_number_of_ranks_gives_the_same_bits(path):
 
 
 @pytest.mark.slow
-def test_the_parent_judges_a_sequence_of_a_plug_in_on_ranks(tmp_path):
+def test_ranks_judge_a_sequence_of_a_plug_in(tmp_path):
     (tmp_path / "mine.py").write_text(FILE)
     text = SUITE.replace('"smalbe", "clarabel"', '"mine"').replace("[1, 2]", "[2]", 1)
     records = run_suite(tmp_path, text, plugins=[tmp_path / "mine.py"]).records
