@@ -564,8 +564,9 @@ def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
     key, count = np.zeros(len(names), dtype=np.int64), cells.max(initial=0) + 1
     for lowest in names.T:
         key = key * count + lowest
-    _, first, times = np.unique(key, return_index=True, return_counts=True)
-    return np.asarray(facets[first[times == 1]])
+    order = np.argsort(key)
+    differs = np.diff(key[order], prepend=-1, append=-1) != 0
+    return np.asarray(facets[order[differs[1:] & differs[:-1]]])
 
 
 def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], ...]:
@@ -579,11 +580,13 @@ def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], 
     facets = cells[:, facet].reshape(-1, facet.shape[1])
     cell = np.repeat(np.arange(len(cells)), len(facet))
     names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
-    # the next sort places these numbers last
-    names[:, 1:][names[:, 1:] == names[:, :-1]] = last
-    names = np.sort(names, axis=1)[:, :dim]
-    is_facet = names[:, -1] < last
-    facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
+    repeated = names[:, 1:] == names[:, :-1]
+    if repeated.any():
+        names[:, 1:][repeated] = last  # the next sort places these numbers last
+        names.sort(axis=1)
+        is_facet = names[:, dim - 1] < last
+        facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
+    names = names[:, :dim]
     if dim > 2:
         repeats = facets == np.roll(facets, -1, axis=1)
         at = np.where(repeats.any(axis=1), repeats.argmax(axis=1), 2)

@@ -143,10 +143,14 @@ class Split:
         Kv = in_precision(self._stiffness, Real) @ self.motions.without(v)
         return self.motions.without(Kv)
 
-    def solve(self, rho: Extended) -> Vector:
-        """Return a solution d (N,) of (5) in double precision, for ρ with Rᵀρ = 0."""
+    def forces(self, rho: NDArray[Any]) -> Any:
+        """Return forces b (N,) in equilibrium, where Tᵀb is ρ without its part in R."""
+        return self.motions.without(rho)
+
+    def solve(self, b: Any) -> Vector:
+        """Solve K_T d = b for b (N,) from `forces`; d then satisfies (5)."""
         assert self.undivided is not None
-        return np.asarray(self.undivided.apply_inverse(rho), dtype=np.float64)
+        return np.asarray(self.undivided.apply_inverse(b), dtype=np.float64)
 
     def variances(self, u: Extended) -> Vector:
         """Return sums (n,) of the squared terms of Ku, without those of KR."""
@@ -175,7 +179,7 @@ class Split:
         strain = [length(self, KR @ k) for k in supported.T]
         return Rounding(np.array(strain), along.astype(np.float64))
 
-    def free(self, v: Extended) -> Extended:
+    def free(self, v: NDArray[Any]) -> NDArray[Any]:
         """Set v (n,) to zero on fixed components, in place."""
         v[self.exact.fixed] = 0
         return v
@@ -201,7 +205,7 @@ class Split:
         square = float(v @ Kv)
         return Residual(self.free(rho), v, square, self.theta(deformed, square))
 
-    def noise(self, u: Extended) -> Extended:
+    def noise(self, u: Extended) -> Vector:
         """Return a sample (n,) of the rounding of Ku."""
         return self.free(sample(self.variances(u), u, self.precision))
 
@@ -219,7 +223,7 @@ class Split:
         Kw, Kv = cancelling(K, w[:, None])[:, 0], self.product(v)
         return self.free(Kw - self.joined(Kv)), abs(float(w @ Kw - v @ Kv))
 
-    def scattered(self, v: Extended) -> Extended:
+    def scattered(self, v: Vector) -> Extended:
         """Return the standard deviation (p,) of Rᵀv for random signs of v (n,).
 
         This is √((R∘R)ᵀ(v∘v)), where R contains the motions that change gaps or slip.
@@ -237,32 +241,36 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
     `size` is the norm of the last correction. If `MAX_REFINEMENTS` corrections do not
     suffice, all of them are added, and the same bound holds.
     """
-    d, Kd = split.spread(0 * rho), split.spread(0 * rho)
-    rest, before = rho, np.inf
-    for _ in range(MAX_REFINEMENTS):
+    d, size = solved(split, rho)
+    Kd = split.product(d)
+    for _ in range(MAX_REFINEMENTS - 1):
+        before, rest = size, rho - split.joined(Kd)
         unbalanced = split.motions.along(rest)
-        step = split.solve(split.motions.without(rest)).astype(Real)
-        pull = split.product(step)
-        square, whole = float(step @ pull), float(d @ Kd)
-        size = np.sqrt(max(square, 0.0))
+        step, size = solved(split, rest)
         q = size / before if before else 0.0
-        if before < np.inf and size <= REFINEMENT_TOLERANCE * np.sqrt(max(whole, 0.0)):
+        if size <= REFINEMENT_TOLERANCE * np.sqrt(max(float(d @ Kd), 0.0)):
             break
         d += step  # in place, since vectors may be large
-        Kd += pull
-        del step, pull
-        before = size
-        rest = rho - split.joined(Kd)
+        Kd += split.product(step)
     return Neighbour(d, Kd, size / (1 - q) if q < 1 else np.inf, unbalanced)
 
 
-def length(split: Split, force: Extended) -> float:
-    """Return the dual norm of forces (n,) without their part along rigid motions."""
-    d = split.solve(split.motions.without(force)).astype(Real)
-    return float(np.sqrt(max(float(d @ split.product(d)), 0.0)))
+def solved(split: Split, force: NDArray[Any]) -> tuple[Extended, float]:
+    """Return a solution of (5), and its energy norm √(bᵀd).
+
+    The norm is the dual norm of the forces (n,) without their part along rigid motions.
+    """
+    b = split.forces(force)
+    d = split.solve(b).astype(Real)
+    return d, float(np.sqrt(max(b @ d, Real(0))))
 
 
-def sample(variances: Vector, u: Extended, precision: Any) -> Extended:
+def length(split: Split, force: NDArray[Any]) -> float:
+    """Return the dual norm of forces (n,), see `solved`."""
+    return solved(split, force)[1]
+
+
+def sample(variances: Vector, u: Extended, precision: Any) -> Vector:
     """Return a sample (n,) of the rounding of Ku in the given precision.
 
     The error of each sum is modelled as a few units in the last place of √`variances`,
@@ -278,8 +286,8 @@ def sample(variances: Vector, u: Extended, precision: Any) -> Extended:
     for shift, by in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(by)
     units = np.where(x >> np.uint64(63), RANDOM_ULPS, -RANDOM_ULPS)
-    sizes = np.finfo(precision).eps * np.sqrt(np.maximum(variances, 0)).astype(Real)
-    return np.asarray((units + SMOOTH_ULPS * np.sign(u)) * sizes)
+    sizes = float(np.finfo(precision).eps) * np.sqrt(np.maximum(variances, 0))
+    return np.asarray((units + SMOOTH_ULPS * np.sign(u.astype(np.float64))) * sizes)
 
 
 class Subdomains(Split):
@@ -308,10 +316,11 @@ class Subdomains(Split):
         rows = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
         inverse = 1 / total
         inverse[fixed] = 0
-        W = diags_array(w[rows])
-        WT = csr_array(W @ T[rows])
+        WT = csr_array(T[rows])  # WT(TᵀWT)^(−½)
+        WT.data *= np.repeat(w[rows], np.diff(WT.indptr))
+        WT.data *= np.sqrt(inverse[WT.indices])
         self._rows, self._R = rows, csr_array(parts.kernel[rows])
-        self._Z = csr_array(W - WT @ (diags_array(inverse) @ WT.T))
+        self._Z = csr_array(diags_array(w[rows]) - WT @ WT.T)
 
     @cached_property
     def _precise(self) -> csr_array:
@@ -370,17 +379,21 @@ class Subdomains(Split):
         """Return K_T v (N,)."""
         return self._parts.product(v)
 
-    def solve(self, rho: Extended) -> Vector:
-        """Solve K_T d = b, where Tᵀb = ρ on free components and R_Tᵀb = 0."""
-        R = self._parts.kernel
+    def forces(self, rho: NDArray[Any]) -> Any:
+        """Return b (N,) with R_Tᵀb = 0, and Tᵀb as in `Split` on free components."""
+        R, rho = self._parts.kernel, self.motions.without(rho)
         b = self._part * (self._T @ rho.astype(np.float64))
         for _ in range(2):  # the second pass restores digits lost by cancellation
             b[self._rows] -= self._Z @ (self._R @ self._coarse(R.T @ b))
+        return b
+
+    def solve(self, b: Any) -> Vector:
+        """Solve K_T d = b."""
         return self._parts.solve(b)
 
     def variances(self, u: Extended) -> Vector:
         """Return (K∘K)(u∘u), summed over subdomains with the squares of Tu."""
-        squares = self.spread(u).astype(np.float64) ** 2
+        squares = (self._T @ u.astype(np.float64)) ** 2
         return np.asarray(self._squares.T @ self._parts.squared_product(squares))
 
     def theta(self, deformed: Extended, square: float) -> float:

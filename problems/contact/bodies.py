@@ -163,7 +163,7 @@ class UnassembledBodies:
         fixed = rigid[self.fixed]
         return not rigid.size or bool(np.linalg.matrix_rank(fixed) == rigid.shape[1])
 
-    @property
+    @cached_property
     def body_of_node(self) -> NDArray[np.int64]:
         """Body of each node, (N,); the last one of several bodies."""
         owner = np.zeros(len(self.mesh.points), dtype=np.int64)

@@ -309,26 +309,21 @@ def largest_stresses(torn: TornBodies, elastic: UnassembledBodies, u: Vector) ->
     u : (n,) nondimensional displacement
     """
     materials, layout, plane = elastic.materials, torn.problem.layout, elastic.plane
-    points, cells, D = (
-        layout.mesh.points,
-        layout.mesh.cells,
-        elasticity_matrices(materials, plane),
-    )
+    points, D = layout.mesh.points, elasticity_matrices(materials, plane)
     rank, u = torn.rank[layout.label], as_vectors(u * elastic.length, layout.mesh.dim)
-
-    def patch(own: int, b: int) -> Patch:
+    patches: list[list[Patch]] = [[] for _ in range(torn.team.comm.size)]
+    for b, material in enumerate(materials):
         of_body = layout.body_of_cell == b
-        is_inside = np.zeros(len(points), dtype=bool)
-        is_inside[cells[of_body & (rank == own)]] = True
-        near = is_inside.copy()
-        for _ in range(STRESS_LAYERS):
-            selected = of_body & near[cells].any(axis=1)
-            near[cells[selected]] = True
-        local = np.cumsum(near)[cells[selected]] - 1
-        return Patch(
-            points[near], local, u[near], is_inside[near], D[b], materials[b].nu, plane
-        )
-
-    ranks, bodies = range(torn.team.comm.size), range(len(materials))
-    patches = [[patch(own, b) for b in bodies] for own in ranks]
+        cells, owner = layout.mesh.cells[of_body], rank[of_body]
+        corners = np.ascontiguousarray(cells.T)
+        for own, of_rank in enumerate(patches):
+            is_inside = np.zeros(len(points), dtype=bool)
+            is_inside[cells[owner == own]] = True
+            near = is_inside.copy()
+            for _ in range(STRESS_LAYERS):
+                selected = cells[near[corners].any(axis=0)]
+                near[selected] = True
+            local = (np.cumsum(near) - 1)[selected]
+            mesh = points[near], local, u[near], is_inside[near]
+            of_rank.append(Patch(*mesh, D[b], material.nu, plane))
     return np.asarray(np.max(torn.team.map(largest_in_patches, patches), axis=0))

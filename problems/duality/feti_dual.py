@@ -132,7 +132,7 @@ def digest_of(served: Served, torn: TornBodies, others: int = 0) -> str:
     (B, c, _), bound = torn.rows, torn.problem.contact.bound
     arrays = (torn.domains.class_of, B.indptr, B.indices, B.data, c, torn.f, bound)
     data = (x.tobytes() for x in arrays)
-    name_of = {k: name for own in served.torn.parts("names") for k, name in own.items()}
+    name_of = served.torn.of_classes("names")
     names = (name_of[k].encode() for k in sorted(name_of))
     return hex_digest((*names, *data, str(others).encode()), 16)
 

@@ -17,6 +17,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from mortarbench.harness import Vector
 from mortarbench.harness.mechanics import boundary_facets
@@ -66,9 +67,9 @@ def _stress_at(
         strip = slice(first, first + STRIP_CELLS)
         cells = mesh.cells[strip]
         gradients, _ = shape_gradients(mesh.points[cells], point)
-        DB = (D if D.ndim == 2 else D[strip]) @ strain_matrix(gradients)
-        u_e = u[dofs_of(cells, mesh.dim)].reshape(len(cells), -1)
-        stress[strip] = np.einsum("esd,ed->es", DB, u_e)
+        u_e = u[dofs_of(cells, mesh.dim)].reshape(len(cells), -1, 1)
+        strain = strain_matrix(gradients) @ u_e
+        stress[strip] = ((D if D.ndim == 2 else D[strip]) @ strain)[..., 0]
     return stress
 
 
@@ -81,22 +82,20 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     interior[boundary_facets(mesh.cells, dim)] = False
     k, terms = values.shape[1], dim + 1
     size = np.ptp(mesh.points, axis=0).max()
-    centre = np.average(
-        mesh.points[mesh.cells],
-        axis=1,
-        weights=np.broadcast_to(corner[..., None], (*corner.shape, dim)),
-    )
+    cells = np.repeat(np.arange(len(corner)), corner.sum(axis=1))
+    where, shape = (mesh.cells[corner], cells), (N, len(corner))
+    of_node = csr_array((np.ones(cells.size), where), shape=shape)
+    centre = of_node.T @ mesh.points / corner.sum(axis=1)[:, None]
+    # basis 1, x, … relative to the node, in units of the extent of the mesh
+    nodes = np.repeat(np.arange(N), np.diff(of_node.indptr))
+    offset = (centre[of_node.indices] - mesh.points[nodes]) / size
+    basis = [of_node.data, *offset.T]
     normal, right = np.zeros((N, terms, terms)), np.zeros((N, terms, k))
-    for nodes, own in zip(mesh.cells.T, corner.T, strict=True):
-        cells, nodes = np.flatnonzero(own), nodes[own]
-        # basis 1, x, … relative to the node, in units of the extent of the mesh
-        offset = (centre[cells] - mesh.points[nodes]) / size
-        basis = np.column_stack([np.ones(nodes.size), offset])
-        for p, q in combinations_with_replacement(range(terms), 2):
-            normal[:, p, q] += np.bincount(nodes, basis[:, p] * basis[:, q], N)
-            normal[:, q, p] = normal[:, p, q]
-        for p, q in np.ndindex(terms, k):
-            right[:, p, q] += np.bincount(nodes, basis[:, p] * values[cells, q], N)
+    for p, q in combinations_with_replacement(range(terms), 2):
+        normal[:, p, q] = normal[:, q, p] = np.bincount(nodes, basis[p] * basis[q], N)
+    for p, weights in enumerate(basis):
+        data = weights, of_node.indices, of_node.indptr
+        right[:, p] = csr_array(data, shape=shape) @ values
 
     polynomial = np.zeros((N, terms, k))
     for first in range(0, N, STRIP_NODES):

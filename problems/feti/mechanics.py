@@ -16,7 +16,7 @@ from mortarbench.harness.mechanics import (
     contact_data,
     friction_discs,
 )
-from mortarbench.problems.fem.elasticity import rigid_modes
+from mortarbench.problems.fem.elasticity import gram_schmidt, rigid_motions
 from mortarbench.problems.fem.mesh import dofs_of
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdomains import DecomposedProblem
@@ -70,23 +70,22 @@ def _rigid_motions(problem: DecomposedProblem) -> dict[str, Any]:
         is_inside[layout.mesh.cells[problem.piece_of[layout.label] == b]] = True
         of_body = np.flatnonzero(is_inside)
         points, dofs = layout.mesh.points[of_body], dofs_of(of_body, d)
-        R = (
-            rigid_modes(points)
-            if d > 1
-            else np.full((len(points), 1), len(points) ** -0.5)
-        )
+        R = np.ones((len(points), 1))
+        if d > 1:
+            R = rigid_motions(points / np.ptp(points, axis=0).max())
         at = d * np.searchsorted(of_body, fixed) + axes
         # the R factor has the same kernel; an SVD of R[at] would form a square matrix
         rows = np.linalg.qr(R[at], mode="r")
-        allowed = R @ null_space(rows, rcond=EPS * max(R[at].shape))
+        allowed = null_space(rows, rcond=EPS * max(R[at].shape))
         if not allowed.shape[1]:  # the supports prevent all motions
             continue
+        allowed = gram_schmidt(R @ allowed)
         allowed[at] = 0
         embedding = csr_array(
             (np.ones(dofs.size), (dofs, np.arange(dofs.size))),
             shape=(d * layout.nodes, dofs.size),
         )
-        rigid.append(embedding @ csr_array(R))
+        rigid.append(embedding @ csr_array(gram_schmidt(R)))
         kernel.append(embedding @ csr_array(allowed))
         names.append(name)
     return {

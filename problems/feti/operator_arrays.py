@@ -19,25 +19,18 @@ def dual_operator(F: DualOperator) -> SerialisableOperator:
     domains = F.domains
     classes = [domains.template(k) for k in range(domains.sizes.size)]
     K = csc_array(block_diag([template.K for template in classes], format="csc"))
-    modes = np.array([template.R.shape[1] for template in classes])
-    R = [
-        np.pad(template.R, ((0, 0), (0, modes.max() - template.R.shape[1])))
-        for template in classes
-    ]
     arrays = {
         **{f"K_{part}": getattr(K, part) for part in _PARTS},
         **{f"B_{part}": getattr(F.B, part) for part in _PARTS},
-        "R": np.concatenate(R),
-        "modes": modes,
-        "stiffness": np.concatenate([template.stiffness for template in classes]),
-        "fixing": np.concatenate([template.fixing for template in classes]),
-        "boundary": np.concatenate([template.boundary for template in classes]),
+        "R": np.concatenate([template.R for template in classes]),
         "kind": domains.class_of,
         "explicit": F.explicit,
         "equalities": np.array(F.equalities),
     }
     for name in _BY_CLASS:
-        arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in classes])
+        values = [getattr(template, name) for template in classes]
+        arrays[name] = np.concatenate(values)
+        arrays[f"{name}_ends"] = np.cumsum([len(v) for v in values])
     if F.semidefinite:
         arrays["redundant"] = np.array(True)
     return SerialisableOperator(
@@ -57,7 +50,7 @@ def dual_operator_from_arrays(arrays: Arrays) -> DualOperator:
         K = (data[within], indices[within] - rows.start, columns - columns[0])
         return SubdomainClass(
             K=csc_array(K, shape=(n, n)),
-            R=arrays["R"][rows, : arrays["modes"][k]],
+            R=arrays["R"][rows],
             fixing=arrays["fixing"][fixing],
             boundary=arrays["boundary"][boundary],
             stiffness=arrays["stiffness"][rows],

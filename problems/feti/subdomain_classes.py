@@ -282,22 +282,24 @@ class Subdomains:
             solution[place] = image
         return solution
 
-    def nodal_blocks(self, d: int) -> Dense:
-        """Return the diagonal block of K for each node, (N, d), by rows.
+    def nodal_blocks(self, d: int) -> dict[int, Dense]:
+        """Return the diagonal blocks of K_k for each node, (n_k/d, d, d), by class.
 
         d : number of components of a node
         """
-        blocks = np.empty((self.start[-1], d))
-        for template, place in self.places():
-            for i, j in np.ndindex(d, d):
-                diagonal = template.K.diagonal(j - i)[min(i, j) :: d]
-                blocks[place[i::d], j] = diagonal[:, None]
-        return blocks
+        return {k: _nodal_blocks(self.template(k).K, d) for k, _ in self.members}
 
 
 def upper_triangle(M: Dense) -> Vector:
     """Return the upper triangle of a symmetric matrix, column by column."""
     return np.asarray(lapack.dtrttp(M)[0])
+
+
+def _nodal_blocks(K: csc_array, d: int) -> Dense:
+    blocks = np.empty((K.shape[0] // d, d, d))
+    for i, j in np.ndindex(d, d):
+        blocks[:, i, j] = K.diagonal(j - i)[min(i, j) :: d]
+    return blocks
 
 
 def _symmetric(M: Dense) -> Dense:

@@ -23,6 +23,7 @@ E, and all other entries depend only on ratios of moduli.
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -44,7 +45,6 @@ from mortarbench.problems.feti.subdivision import (
 )
 from mortarbench.problems.feti.subdomain_classes import (
     Assembly,
-    Dense,
     SubdomainClass,
     Subdomains,
 )
@@ -232,23 +232,32 @@ class TornBodies:
 
     def kernel(self) -> csr_array:
         """Return R = diag(R_1 … R_S) (N, r), the rigid motions of all subdomains."""
-        R_of = self._modes()
-        return block_diagonal([R_of[k] for k in self.domains.class_of.tolist()])
+        R_of, start = self.of_classes("modes"), self.domains.start
+        blocks = [R_of[k] for k in self.domains.class_of.tolist()]
+        N, S, r = start[-1], len(blocks), blocks[0].shape[1]
+        column = np.arange(r * S, dtype=np.int32).reshape(S, r)
+        columns = np.repeat(column, np.diff(start), axis=0).ravel()
+        ends = r * np.arange(N + 1, dtype=np.int32)
+        data = np.concatenate(blocks).ravel()
+        R = csr_array((data, columns, ends), shape=(N, r * S))
+        R.eliminate_zeros()
+        return R
 
     def moved(self, alpha: Vector) -> Vector:
         """Return Rα (N,), without forming R, which is large."""
-        domains, R_of = self.domains, self._modes()
-        modes = np.array([R_of[k].shape[1] for k in range(domains.sizes.size)])
-        first = np.cumsum(modes[domains.class_of]) - modes[domains.class_of]
-        v = np.empty(domains.start[-1])
+        domains, R_of = self.domains, self.of_classes("modes")
+        motions, v = (
+            alpha.reshape(domains.class_of.size, -1),
+            np.empty(domains.start[-1]),
+        )
         for k, members in domains.members:
             place = domains.start[members] + np.arange(domains.sizes[k])[:, None]
-            v[place] = R_of[k] @ alpha[first[members] + np.arange(modes[k])[:, None]]
+            v[place] = R_of[k] @ motions[members].T
         return v
 
-    def _modes(self) -> dict[int, Dense]:
-        """Return the rigid motions of each class."""
-        return {k: R for own in self.parts("modes") for k, R in own.items()}
+    def of_classes(self, method: str, *arguments: Any) -> dict[int, Any]:
+        """Return the results of a method of `Subdomains` for all classes."""
+        return dict(ChainMap(*self.parts(method, *arguments)))
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -316,20 +325,6 @@ class TornBodies:
 def itself(part: T) -> T:
     """Return the argument."""
     return part
-
-
-def block_diagonal(blocks: list[Dense]) -> csr_array:
-    """Return the block diagonal matrix of dense blocks, without zeros."""
-    modes, size = (np.array([R.shape[axis] for R in blocks]) for axis in (1, 0))
-    # numbers of entries and first columns of all rows
-    width, first = (np.repeat(v, size) for v in (modes, np.cumsum(modes) - modes))
-    ends = np.append(0, np.cumsum(width)).astype(np.int32)
-    column = np.arange(ends[-1], dtype=np.int32)
-    column += np.repeat((first - ends[:-1]).astype(np.int32), width)
-    data = np.concatenate([R.ravel() for R in blocks])
-    matrix = csr_array((data, column, ends), shape=(size.sum(), modes.sum()))
-    matrix.eliminate_zeros()
-    return matrix
 
 
 class Rows(NamedTuple):

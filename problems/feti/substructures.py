@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from mortarbench.harness import Vector
+from mortarbench.problems.fem.mesh import dofs_of
 from mortarbench.problems.feti.subdomains import TornBodies
 
 
@@ -42,17 +43,19 @@ class LocalProblems:
 
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
         """Return the diagonal entries of TᵀKT for the columns `at` (k,) of T."""
-        T, blocks = csr_array(self.spread[:, at]), self._nodal_blocks
-        ends = np.arange(len(blocks) + 1)
-        K = csr_array(bsr_array((blocks, ends[:-1], ends), shape=(T.shape[0],) * 2))
-        return np.asarray(T.multiply(K @ T).sum(axis=0))
+        d = self.torn.problem.components
+        copies = np.flatnonzero(np.isin(self.torn.nodes.number, at // d))
+        T, ends = self.spread[dofs_of(copies, d)], np.arange(copies.size + 1)
+        blocks = self._nodal_blocks[copies], ends[:-1], ends
+        K = csr_array(bsr_array(blocks, shape=(T.shape[0],) * 2))
+        return np.asarray(T.multiply(K @ T).sum(axis=0)[at])
 
     @property
     def _nodal_blocks(self) -> NDArray[np.float64]:
         """Diagonal block of K for each torn node, (M, d, d)."""
-        d = self.torn.problem.components
-        blocks = np.concatenate(self.torn.parts("nodal_blocks", d))
-        return blocks.reshape(-1, d, d)
+        of_class = self.torn.of_classes("nodal_blocks", self.torn.problem.components)
+        members = self.torn.domains.class_of.tolist()
+        return np.concatenate([of_class[k] for k in members])
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
         """Apply PKP to v (N,); see `Subdomains.product`."""
