@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from mortarbench.case import Case, as_case
 from mortarbench.harness import Record, Solver, Verdict, checked
-from mortarbench.harness.distributed.mpi import ranks_asked
+from mortarbench.harness.distributed.mpi import ranks_asked, too_few_parts
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.names import assemble, family_name
 from mortarbench.harness.processes.scratch import single_worker
@@ -313,13 +313,22 @@ def solve(
         name = type(solver).__name__
         solvers = {name: solver}
     spec = SolverSpec(name=name, label=name, options=requested).on(ranks)
+    declined = ""
+    if ranks > 1:
+        named = as_case(case, registries=registries).id
+        divided = named.family.divided(named.form)
+        parts = 1 if divided is None else divided.subdomains
+        declined = too_few_parts(parts, ranks) if parts < ranks else ""
+    solution: Solution | None = None
+    notes: tuple[str, ...] = ()
     with ExitStack() as stack:
-        command = partial(registries.worker_command, spec, records=True)
-        copied = None
-        if not isinstance(solver, str):
-            copied = resolve(with_history(spec, solvers), solvers)
-        # The worker imports its libraries while this process imports its own.
-        worker = stack.enter_context(single_worker(command, copied))
+        if not declined:
+            command = partial(registries.worker_command, spec, records=True)
+            copied = None
+            if not isinstance(solver, str):
+                copied = resolve(with_history(spec, solvers), solvers)
+            # The worker imports its libraries while this process imports its own.
+            worker = stack.enter_context(single_worker(command, copied))
         defer_parts_of_numpy()
         problem = as_case(case, registries=registries)
 
@@ -335,7 +344,13 @@ def solve(
             repeat=0,
             environment=digest(registries.environment()),
         )
-        record, solution, notes = _measured(worker, problem, record, time_limit)
+        if declined:
+            record = record.replace(status=Verdict.DECLINED, message=declined)
+        else:
+            own = isinstance(solver, str) and registries.hold_only_builtins()
+            record, solution, notes = _measured(
+                worker, problem, record, own, time_limit
+            )
     return Answer(
         case=problem,
         record=record,
@@ -347,7 +362,7 @@ def solve(
 
 
 def _measured(
-    worker: WorkerProcess, problem: Case, record: Record, time_limit: float
+    worker: WorkerProcess, problem: Case, record: Record, own: bool, time_limit: float
 ) -> tuple[Record, Solution | None, tuple[str, ...]]:
     """Measure once; return the record, the answer, and remarks."""
     from mortarbench.harness.processes.measurement import measure_once
@@ -359,6 +374,7 @@ def _measured(
             worker,
             lambda: problem.family_case,
             record,
+            own_code_only=own,
             time_limit=time_limit,
         )
         # remarks on the input are known only if this process has built the case

@@ -25,7 +25,8 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     """Run a worker, on one process or on ranks; called by commands of `Registries`.
 
     arguments : a JSON object, and the file descriptors for requests and replies. The
-        worker measures a solver if the object contains its specification
+        worker measures a solver if the object contains its specification, unless it
+        also contains ``judges``
     """
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
@@ -34,7 +35,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         return launch(ranks, [*registries.start, "worker", *arguments])
     registries = registries.with_files(request["plugins"])
     solver = None
-    if "solver" in request:
+    if "solver" in request and "judges" not in request:
         spec, solvers = SolverSpec(**request["solver"]), registries.solvers
         if "copy" in request:
             solvers = {spec.name: read_solver(Path(request["copy"]))}

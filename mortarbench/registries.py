@@ -19,6 +19,7 @@ from mortarbench.harness.registry import (
     Plugin,
     PluginFile,
     SolverSpec,
+    entry_points_of,
     load_plugin,
     merged,
     options_of,
@@ -207,7 +208,14 @@ class Registries:
         return Commands(
             solvers={s.label: self.worker_command(s) for s in specs},
             case_worker=[*self.start, "worker", json.dumps(request)],
+            own_code_only=self.hold_only_builtins(),
         )
+
+    def hold_only_builtins(self) -> bool:
+        """Return True if neither a file nor an installed package adds a plug-in."""
+        groups = "mortarbench.problems", "mortarbench.solvers"
+        installed = any(entry_points_of(group) for group in groups)
+        return self.solvers is SOLVERS and not self.files and not installed
 
     def environment(self) -> dict[str, Any]:
         """Return the environment of the processes of a run; see `capture`."""

@@ -121,8 +121,8 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
     """Return reasons to doubt a verified answer, one line each.
 
     Although the QP is solved, the certified bound may be large or infinite, or the
-    model may be inadequate: no node is in contact, or displacements are too large for
-    linear kinematics.
+    model may be inadequate: no node or only one node is in contact, or displacements
+    are too large for linear kinematics.
     """
     if record.status is not Verdict.VERIFIED or solution is None:
         return ()
@@ -147,6 +147,11 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
                 "no node is in contact, so the answer is the same as without contact "
                 "conditions; check the direction of the load and the initial gap"
             )
+        elif _single_nodes(record):
+            reasons.append(
+                "a single node is in contact, so the computed pressure depends on the "
+                "mesh width and grows on finer meshes; refine the mesh near the contact"
+            )
         if record.quantities.get("undetermined_friction"):
             reasons.append(
                 "friction forces are not unique: where supports or other contact rows "
@@ -157,6 +162,14 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
     with suppress(Exception), one_thread():
         reasons += _large_displacements(case, solution)
     return tuple(reasons)
+
+
+def _single_nodes(record: Record) -> bool:
+    """Return True if a pair with several rows is in contact at a single node."""
+    pairs = record.quantities.get("contacts", {}).values()
+    return any(pair.get("active") == 1 for pair in pairs) and (
+        record.quantities["contact_rows"] > len(pairs)
+    )
 
 
 def _is_open(case: Case, record: Record, solution: Solution) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -41,6 +42,7 @@ def measure_and_judge(
     *,
     out: Path,
     qp_file: tuple[Path, str] | None = None,
+    own_code_only: bool = False,
     time_limit: float,
     memory_limit: float = inf,
     **entries: Any,
@@ -54,6 +56,8 @@ def measure_and_judge(
     out : file to which the worker writes the point
     qp_file : file with the QP, and digest of its content; None if ranks build the QP,
         judge the answer, and compute its quantities and error bounds
+    own_code_only : False if code of plug-ins may run on the ranks, so that new ranks
+        judge the answer
     time_limit, memory_limit : limits in s and MiB
     entries : further entries of the request, see `harness.processes.worker`
 
@@ -71,7 +75,8 @@ def measure_and_judge(
     """
     request = {"out": str(out), "tol": record.tol, **entries}
     if qp_file is None:
-        request |= {"case": case_entry(record), "judged_at": record.judged_at}
+        request["case"] = case_entry(record)
+        request["judged_at"] = record.judged_at if own_code_only else None
     else:
         request |= {"qp": str(qp_file[0]), "digest": qp_file[1]}
     if not isinf(memory_limit):
@@ -108,12 +113,41 @@ def measure_and_judge(
     if qp_file is not None:
         record = judged(record, qp, solution)
     else:
-        fields = dict(reply.answer["fields"])
+        known = (
+            reply.answer
+            if own_code_only
+            else _judged_apart(worker, record, out, solution.status)
+        )
+        fields = dict(known["fields"])
         fields["status"] = Verdict(fields["status"])
         record = claimed(record, solution).replace(**fields)
-        more += reply.answer["notes"]
+        more += known["notes"]
     record = noted(record, reply.message, *notes, *more)
     return _check_memory(memory_limit, record), solution
+
+
+def _judged_apart(
+    worker: WorkerProcess, record: Record, point: Path, status: Status
+) -> Mapping[str, Any]:
+    """Judge a stored point on new ranks, which have not run the solver.
+
+    Raises
+    ------
+    FaultError
+        If the new ranks end without a verdict.
+
+    """
+    request = {
+        "case": case_entry(record),
+        "point": str(point),
+        "claimed": status,
+        "judged_at": record.judged_at,
+    }
+    with closing(worker.judge()) as judge:
+        reply = judge.ask(request, time_limit=inf, memory_limit=inf)
+    if reply.answer is None:
+        raise FaultError(f"{record.case} could not be judged: {reply.message}")
+    return reply.answer
 
 
 def _solution(point: Path, answer: Mapping[str, Any]) -> Solution:
@@ -176,11 +210,13 @@ def measure_once(
     case: Callable[[], Case],
     record: Record,
     *,
+    own_code_only: bool = False,
     time_limit: float = inf,
 ) -> tuple[Record, Solution | None]:
     """Measure once, judge the answer, and compute quantities and bounds.
 
     case : returns the case; the first call builds it. Not called if ranks build it
+    own_code_only : see `measure_and_judge`
     time_limit : limit of the solve, in s
 
     Raises
@@ -202,6 +238,7 @@ def measure_once(
             record,
             out=scratch / "point.npz",
             qp_file=qp_file,
+            own_code_only=own_code_only,
             time_limit=time_limit,
         )
         try:

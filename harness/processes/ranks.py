@@ -170,15 +170,22 @@ class Ranks:
             "rank_peak_mib_mean": sum(peaks) / len(peaks),
         }
 
-    def judge(self, s: Solution, tol: float) -> tuple[dict[str, Any], list[str]]:
-        """Judge an answer with new factors; return fields of a record, and notes."""
+    def judge(self, s: Solution, tol: float) -> dict[str, Any]:
+        """Judge an answer with new factors.
+
+        Returns
+        -------
+        ``fields``, the entries of a record with the verdict, and ``notes``
+
+        """
         # after a failure of ranks, products would fail again
         if self.case is None or (s.status is Status.FAILED and not has_point(s)):
-            return {"status": Verdict(s.status)}, []
+            return {"fields": {"status": Verdict(s.status)}, "notes": []}
         # factors that code of a solver may have reached are not used
         if hasattr(self.case.qp.P, "forget"):
             self.case.qp.P.forget()
-        return evaluated(self.case, s, tol)
+        fields, notes = evaluated(self.case, s, tol)
+        return {"fields": fields, "notes": [*filter(None, notes)]}
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,12 @@ class WorkerProcess:
         with _LOCK:
             self._all.add(self)
 
+    def judge(self) -> WorkerProcess:
+        """Return a new worker that has no solver and only judges on ranks."""
+        *start, request = self._command
+        command = [*start, json.dumps({**json.loads(request), "judges": True})]
+        return WorkerProcess(command, self._log.with_suffix(".judge"))
+
     @_LOCK
     def start(self) -> None:
         """Start the process without waiting for it; the first request reports errors.
@@ -216,7 +222,7 @@ class WorkerProcess:
             *[("built", time_limit)] * is_shared,
             ("start", START_SECONDS),
             *[("solved", time_limit), ("timed", REPEAT_SECONDS)] * is_timed,
-            *[("measured", POINT_SECONDS)] * is_shared,
+            *[("measured", POINT_SECONDS)] * (is_shared and is_timed),
         ]
         try:
             for event, limit in events:

@@ -12,9 +12,11 @@ The process follows `harness.processes.protocol` and answers these requests:
 
 * ``{"case": {…}, "tol": TOL, "judged_at": TOL, "out": PATH}``: build a case on the MPI
   ranks (`harness.plugin.Family.divided`), measure, write the point to ``out``, and
-  judge the answer at the tolerance ``judged_at``.
-  The event ``built`` contains the fields ``sizes``, ``qp`` and ``build_seconds`` of
-  the record; the event ``measured`` is sent when the point has been written
+  judge the answer at the tolerance ``judged_at``, unless this is null. With ``point``,
+  the path of a point, and the solver's claim ``claimed`` instead of ``tol`` and
+  ``out``, the ranks only judge this point. The event ``built`` contains the fields
+  ``sizes``, ``qp`` and ``build_seconds`` of the record; the event ``measured`` is sent
+  when the point has been written
 * ``{"build": …}`` and ``{"describe": …}``: see `harness.processes.cases`
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
@@ -42,7 +44,7 @@ from threadpoolctl import ThreadpoolController
 
 from mortarbench.harness.files.mapped import content_digest
 from mortarbench.harness.files.qpfile import load_qp
-from mortarbench.harness.files.store import write_point
+from mortarbench.harness.files.store import read_point, write_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.cases import Cases
@@ -52,7 +54,7 @@ from mortarbench.harness.processes.protocol import (
 )
 from mortarbench.harness.processes.ranks import Build, Ranks
 from mortarbench.harness.qp import QP, no_rows
-from mortarbench.harness.solution import Solution
+from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import (
     DeclinedError,
     Prepare,
@@ -110,6 +112,11 @@ class Worker:
             return self.warm_up()
         if "out" in request:
             return self._measure(request, send)
+        if "point" in request and self.ranks is not None:
+            send("built", **self.ranks.build(request["case"]))
+            send("start")
+            s = read_point(Path(request["point"]), Status(request["claimed"]))
+            return self.ranks.judge(s, request["judged_at"])
         send("start")
         if "check" in request:
             # few requests need this import
@@ -189,8 +196,8 @@ class Worker:
         write_point(Path(request["out"]), s)
         if ranks is not None:
             send("measured")
-            fields, notes = ranks.judge(s, request["judged_at"])
-            judged = {"fields": fields, "notes": [*filter(None, notes)]}
+            if request["judged_at"] is not None:
+                judged = ranks.judge(s, request["judged_at"])
         return {
             **judged,
             "claimed": s.status,

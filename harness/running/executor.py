@@ -165,6 +165,7 @@ class Executor:
             record,
             out=self._point,
             qp_file=qp_file,
+            own_code_only=self.commands.own_code_only,
             time_limit=block.time_limit,
             memory_limit=block.memory_limit,
             **entries,

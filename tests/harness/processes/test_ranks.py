@@ -10,6 +10,7 @@ from mortarbench.harness.distributed import mpi
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.store import load_solution
 from mortarbench.harness.solution import Status
+from mortarbench.registries import Registries
 from tests.support.hexahedra import TETRAHEDRA
 from tests.support.solid_blocks import TOML, solid_blocks
 
@@ -91,11 +92,12 @@ def test_thirty_solves_on_four_ranks_do_not_diverge():
 
 
 #: solvers that need only products with P: one is smalbe under another name, the other
-#: returns a point that is not a solution
+#: returns a point that is not a solution, and bribes the judge in its own process
 FILE = """
 from dataclasses import dataclass
 import numpy as np
 from mortarbench import Solution, Status
+from mortarbench.harness.processes import ranks
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 class Mine(SMALBE):
@@ -107,6 +109,7 @@ class Liar:
 
     def prepare(self, qp, tol):
         x = 0 * (qp.P @ qp.q)
+        ranks.evaluated = lambda *_: ({"status": "verified"}, [])
         return lambda: Solution(
             status=Status.SOLVED, x=x, y=0 * qp.b, z=0 * qp.h, z_box=x
         )
@@ -115,7 +118,7 @@ SOLVERS = {"mine": Mine(), "liar": Liar()}
 """
 
 
-def test_a_false_claim_of_a_plug_in_on_ranks_is_refuted(tmp_path):
+def test_new_ranks_judge_a_plug_in(tmp_path):
     (tmp_path / "mine.py").write_text(FILE)
     answer = mb.solve(
         MEMBRANES, "liar", tol=1e-6, ranks=2, plugins=[tmp_path / "mine.py"]
@@ -132,7 +135,10 @@ def test_a_false_claim_of_a_plug_in_on_ranks_is_refuted(tmp_path):
         ("beam-ring/Nr=2/Nh=2/steps=1/dual", "the case is not in subdomains; expected"),
     ],
 )
-def test_cases_that_ranks_cannot_divide_are_declined(name, message):
+def test_cases_that_ranks_cannot_divide_are_declined_before_any_rank_starts(
+    name, message, monkeypatch
+):
+    monkeypatch.setattr(Registries, "worker_command", lambda *_: ["false"])
     answer = mb.solve(name, "smalbe", ranks=3)
     assert answer.verdict == "declined"
     assert answer.record.message.startswith(message)
@@ -218,7 +224,7 @@ def test_the_same_number_of_ranks_gives_the_same_bits(path):
 
 
 @pytest.mark.slow
-def test_ranks_judge_a_sequence_of_a_plug_in(tmp_path):
+def test_new_ranks_judge_a_sequence_of_a_plug_in(tmp_path):
     (tmp_path / "mine.py").write_text(FILE)
     text = SUITE.replace('"smalbe", "clarabel"', '"mine"').replace("[1, 2]", "[2]", 1)
     records = run_suite(tmp_path, text, plugins=[tmp_path / "mine.py"]).records
