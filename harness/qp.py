@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array, csc_array, issparse, tril, triu
+from scipy.sparse import coo_array, csc_array, issparse
 
 from mortarbench.harness.errors import InputError, shortened, shown
 from mortarbench.harness.sets.blocks import Blocks
@@ -435,7 +435,7 @@ def check_symmetric(P: Matrix) -> None:
     ------
     ValueError
         If P is not symmetric. The message states the two entries with the largest
-        difference, and a hint if P is triangular.
+        difference.
 
     """
     difference = coo_array(abs(P - P.T))
@@ -445,7 +445,8 @@ def check_symmetric(P: Matrix) -> None:
         i, j = (int(index[k]) for index in difference.coords)
         raise ValueError(
             f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by "
-            f"{difference.data[k]:.3g}{_triangle(P)}"
+            f"{difference.data[k]:.3g}; expected both triangles: P + P.T - "
+            "diag(diag(P)) for a triangular P"
         )
 
 
@@ -486,18 +487,6 @@ def check_convex(P: Matrix) -> None:
             "P is not positive semidefinite: it has a negative eigenvalue; expected a "
             "convex QP"
         ) from None
-
-
-def _triangle(P: Matrix) -> str:
-    """Return a hint for the message if an asymmetric P is triangular, else ""."""
-    lower, upper = (tril, triu) if issparse(P) else (np.tril, np.triu)
-    for name, other in (("upper", lower(P, -1)), ("lower", upper(P, 1))):
-        if not abs(other).max():
-            return (
-                f"; P is {name} triangular: expected both triangles, "
-                "P + P.T - diag(diag(P))"
-            )
-    return ""
 
 
 def canonical(M: Matrix) -> Matrix:

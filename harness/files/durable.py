@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,7 +23,6 @@ _UNFINISHED = ".mortarbench-*.tmp"
 #: error numbers of a full disk, an exhausted quota and an exceeded file size limit
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PROBE_BYTES = 2**16  #: number of bytes that are written to test whether a disk is full
-_MIB = 2**20
 
 
 @contextmanager
@@ -87,7 +85,7 @@ def report_full_disk(folder: Path) -> Iterator[None]:
     ------
     InputError
         If the disk is full, a quota is exhausted or a file size limit is reached; the
-        message names the file system and a remedy.
+        message names a remedy.
 
     """
     try:
@@ -107,8 +105,8 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
     Raises
     ------
     InputError
-        If `failure` reports a full disk, or the disk is full now; the message names
-        the file system and a remedy.
+        If `failure` reports a full disk, or the disk is full now; the message names a
+        remedy.
 
     """
     for code in FULL:
@@ -129,14 +127,9 @@ def _full(path: Path, code: int) -> str:
 
     code : error number, one of `FULL`
     """
-    there = next(p for p in (path, *path.absolute().parents) if p.exists())
-    root = there.absolute()
-    while not os.path.ismount(root):
-        root = root.parent
-    free = shutil.disk_usage(there).free / _MIB
     return (
-        f"{path} cannot be written: {os.strerror(code)} (file system {root}, "
-        f"{free:.1f} MiB free); free some space; the same command continues the run"
+        f"{path} cannot be written: {os.strerror(code)}; free some space; the same "
+        "command continues the run"
     )
 
 

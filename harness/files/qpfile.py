@@ -195,7 +195,9 @@ def malformed(path: Path) -> Iterator[None]:
     with located(f"{path}"):
         try:
             yield
-        except (ValueError, TypeError, OverflowError, KeyError) as e:
+        except KeyError as e:
+            raise InputError(f"{e} is missing") from None
+        except (ValueError, TypeError, OverflowError) as e:
             raise InputError(shortened(" ".join(str(e).split()))) from None
 
 
@@ -214,7 +216,7 @@ def _serialised_qp(
 ) -> QP:
     """Return the QP of a file written with `serialised`; arrays are not copied."""
     matrices = {name: _matrix(arrays, name) for name in _MATRICES}
-    for name in listed_dense(meta):
+    for name in meta["dense"]:
         # if all entries are stored, use a view of the values, which may be mapped
         M = matrices[name]
         rows, columns = M.shape
@@ -247,12 +249,13 @@ def qp_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[QP, dict[str, Any]]:
             raise unknown("array", name, (*VECTORS, *_MATRICES))
     parts: dict[str, Any] = {name: stored_matrix(arrays, name) for name in _MATRICES}
     parts |= {name: _vector(arrays, name) for name in VECTORS if name in arrays}
-    for name in _MATRICES if "dense" in meta else ():
+    dense = set(meta.get("dense", _MATRICES))
+    for name in _MATRICES:
         M = parts[name]
-        if issparse(M) and name in listed_dense(meta):
+        if issparse(M) and "dense" in meta and name in dense:
             check_dense(name, M)
             parts[name] = M.toarray()
-        elif isinstance(M, np.ndarray) and name not in listed_dense(meta):
+        elif isinstance(M, np.ndarray) and name not in dense:
             parts[name] = csc_array(M)
     qp = QP.from_arrays(**{"q": None, **parts}, sets=further_sets(arrays))
     return qp, meta
@@ -265,27 +268,9 @@ def stored_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | Non
         if M.ndim != 2:
             raise ValueError(f"{name} has shape {M.shape}; expected two dimensions")
         return M
-    parts = [f"{name}_{part}" for part in _PARTS]
-    there = [part for part in parts if part in arrays]
-    if there and len(there) < len(parts):
-        lacking = ", ".join(part for part in parts if part not in arrays)
-        raise ValueError(f"{lacking} missing, but {there[0]} is present")
-    return _matrix(arrays, name) if there else None
-
-
-def listed_dense(meta: Mapping[str, Any]) -> set[str]:
-    """Return the names of the matrices that the meta data list as dense.
-
-    Raises
-    ------
-    ValueError
-        If the entry ``dense`` is not a list of strings.
-
-    """
-    names = meta.get("dense", [])
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError("meta: dense is not a list of names")
-    return set(_MATRICES).intersection(names)
+    if not any(f"{name}_{part}" in arrays for part in _PARTS):
+        return None
+    return _matrix(arrays, name)
 
 
 def check_dense(name: str, M: Matrix) -> None:

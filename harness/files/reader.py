@@ -18,7 +18,6 @@ import json
 import os
 import re
 import resource
-import signal
 import sys
 import warnings
 import zipfile
@@ -27,8 +26,6 @@ from typing import Any
 import numpy as np
 
 CPU_SECONDS = 60  #: CPU time after which the kernel kills this process
-#: elapsed time after which the kernel kills this process, since reading may block
-SECONDS = 600
 #: number of bytes of address space in addition to a multiple of the size of the data
 ROOM = 2**29
 TOO_LARGE = 3  #: exit code if the data exceed the limit
@@ -133,7 +130,6 @@ def main(limit: str, kind: str, *arguments: str) -> None:
     """Read the file on standard input, and write its arrays to standard output."""
     max_bytes = int(limit)
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
-    signal.alarm(SECONDS)
     try:
         arrays = mat(max_bytes) if kind == "mat" else parquet(max_bytes, *arguments)
         if sum(array.nbytes for array in arrays.values()) > max_bytes:

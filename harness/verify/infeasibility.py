@@ -198,33 +198,22 @@ def _rays(qp: QP, s: Solution) -> Iterator[Vector]:
 
 
 def steepest_ray(qp: QP) -> Iterator[Vector]:
-    """Yield the ray of steepest descent with ‖r̂‖∞ ≤ 1, if it is found."""
+    """Yield the ray of steepest descent with ‖r̂‖∞ ≤ 1, if it is found.
+
+    Cones are relaxed to their smallest enclosing box.
+    """
     if not qp.is_explicit:
         return
     by, (lower, upper) = scaling_of(qp), hull(qp.sets, qp.q.size)
     low, high = -1.0 * np.isinf(lower), 1.0 * np.isinf(upper)
-    rows = [csr_array(diags_array(by.F) @ csr_array(qp.G) @ diags_array(by.D))]
-    for one in qp.sets[1:]:
-        if isinstance(one, Cones):  # a box of tangents inside each cone
-            for column in range(1, one.index.shape[1]):
-                rows += [_edges(one, column, sign, by.D) for sign in (-1.0, 1.0)]
-    G = csr_array(vstack(rows))
     D = diags_array(by.D)
+    G = csr_array(diags_array(by.F) @ csr_array(qp.G) @ D)
     A = vstack([diags_array(by.E) @ csr_array(qp.A) @ D, D @ csr_array(qp.P) @ D])
     solved = _linear_program(
         by.D * qp.q, G, np.zeros(G.shape[0]), csr_array(A), np.stack([low, high])
     )
     if solved is not None:
         yield by.D * solved.x
-
-
-def _edges(cones: Cones, column: int, sign: float, D: Vector) -> Any:
-    """Return rows (k, n) of ±x_T ≤ μx_N/√(d − 1) for one tangential component."""
-    (k, d), ones = cones.index.shape, np.ones(len(cones.slope))
-    data = np.stack([sign * ones, -cones.slope / np.sqrt(d - 1)], axis=1)
-    columns = cones.index[:, [column, 0]]
-    places = np.repeat(np.arange(k), 2), columns.ravel()
-    return csr_array((data.ravel() * D[places[1]], places), shape=(k, D.size))
 
 
 def _linear_program(cost: Vector, G: Any, h: Vector, A: Any, bounds: Any) -> Any | None:

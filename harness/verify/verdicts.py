@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from time import perf_counter
@@ -181,7 +180,7 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     """
     if not has_point(s):
         return {}, ""
-    mechanics, was_loaded = case.mechanics, LATE_IMPORT in sys.modules
+    mechanics = case.mechanics
     if mechanics is None and case.certifiable is None:
         least = getattr(case.qp.P, "least_eigenvalue", None)
         if least is None or not least > 0 or case.qp.b.size + case.qp.h.size:
@@ -194,14 +193,7 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
             return certify_pair(*case.certifiable(s))
         return certify(mechanics, mechanics.to_primal(s))
 
-    result = _certified(certificate)
-    if not was_loaded and LATE_IMPORT in sys.modules:  # exclude the time of the import
-        result = _certified(certificate)
-    return result
-
-
-#: module that loads slowly, needed by `certify` for some bodies
-LATE_IMPORT = "scipy.optimize"
+    return _certified(certificate)
 
 
 def _certified(

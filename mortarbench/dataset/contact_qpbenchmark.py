@@ -1,9 +1,8 @@
 """Test sets of qpbenchmark, read from the npz files beside this file.
 
-``qpbenchmark contact_qpbenchmark.py run --author NAME`` runs the core. The files
-``contact_every.py``, ``contact_dense.py``, ``contact_strictly_convex.py`` are further
-test sets. Problems with discs, and those without a solution, are left out, because
-qpbenchmark cannot state them.
+``qpbenchmark contact_qpbenchmark.py run --author NAME`` runs the core, and
+``contact_every.py`` all problems. Problems with discs, and those without a solution,
+are left out, because qpbenchmark cannot state them.
 """
 
 import csv
@@ -24,7 +23,8 @@ class ContactQpbenchmark(TestSet):
     title = "Contact problems"
     description = "Elastic contact problems with proven optima, of order one."
     sparse_only = False
-    column = "core"  #: column of the catalogue that is ``yes`` for members
+    #: entries of members in the column ``core`` of the catalogue
+    members: tuple[str, ...] = ("yes",)
 
     def __iter__(self) -> Iterator[Problem]:
         """Yield the problems in the order of the catalogue."""
@@ -32,27 +32,14 @@ class ContactQpbenchmark(TestSet):
             rows = list(csv.DictReader(file))
         for row in rows:
             has_optimum = row["kind"] == "optimal" and row["discs"] == "0"
-            is_member = row.get(self.column, "yes") == "yes"
-            if has_optimum and is_member and not row["sequence"]:
+            if has_optimum and row["core"] in self.members and not row["sequence"]:
                 yield load(FOLDER / row["path"], row["name"])
 
 
 class ContactEvery(ContactQpbenchmark):
     """All single problems."""
 
-    column = ""
-
-
-class ContactDense(ContactQpbenchmark):
-    """Problems with a dense P, which are the duals."""
-
-    column = "dense"
-
-
-class ContactStrictlyConvex(ContactQpbenchmark):
-    """Problems whose P has no eigenvalue that is small by comparison."""
-
-    column = "strictly_convex"
+    members = ("yes", "no")
 
 
 def load(path: Path, name: str) -> Problem:

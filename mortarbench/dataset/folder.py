@@ -37,8 +37,6 @@ COPIED = {
     **{name: name for name in ("README.md", "LICENSE", "CITATION.cff", TEST_SET)},
     **{name: name for name in ("selection.py", "candidates.toml")},
     "contact_every.py": TEST_SET,
-    "contact_dense.py": TEST_SET,
-    "contact_strictly_convex.py": TEST_SET,
 }
 
 

@@ -47,14 +47,6 @@ class FlipsSigns(Sound):
         return replace(s, y=-s.y)
 
 
-class HoldsAbsentBounds(Sound):
-    by = 1e-13
-
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        return replace(s, z_box=s.z_box - self.by)
-
-
 class Remembers(Sound):
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -96,16 +88,6 @@ class CachesByShape(Caches):
 class CachesByAddress(Caches):
     def key(self, qp):
         return qp.q.ctypes.data
-
-
-class CachesInChains(CachesByContent):
-    """Solver that reuses answers of earlier sequences, but not of single QPs."""
-
-    def prepare(self, qp, tol):
-        return lambda: self.honest(qp, tol)
-
-    def chain(self, tol):
-        return lambda qp: lambda: self.act(qp, tol)
 
 
 class CachesThePreparation(Sound):

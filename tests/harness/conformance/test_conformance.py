@@ -25,13 +25,11 @@ from tests.support.faulty_solvers import (
     CachesByAddress,
     CachesByContent,
     CachesByShape,
-    CachesInChains,
     CachesThePreparation,
     Compiles,
     CompilesOnce,
     DeclinesAll,
     FlipsSigns,
-    HoldsAbsentBounds,
     MindsTheOrder,
     MindsUnits,
     Raises,
@@ -163,7 +161,6 @@ def test_smalbe_pdas_and_projected_gradient_have_no_weakness(name):
         (StopsEarly, "finds the planted solution: everything"),
         (StopsEarly, "reaches the tolerance: bounds"),
         (FlipsSigns, "gives multipliers our signs"),
-        (HoldsAbsentBounds, "puts none on absent bounds"),
         (Remembers, "starts every repeat cold, same answer"),
         (Wanders, "starts every repeat cold, same answer"),
         (Scales, "leaves the problem alone: everything"),
@@ -208,18 +205,8 @@ def test_a_solver_that_remembers_answers_is_named(kind):
 @pytest.mark.usefixtures("clock")
 def test_a_slow_first_call_is_not_accused(kind):
     MEMORIES.clear()
-    for check in CHECKS:
-        if check.startswith("remembers no answer"):
-            grade, message = run_check(check, kind())
-            assert grade in (Grade.PASS, Grade.DECLINE), message
-
-
-@pytest.mark.usefixtures("clock")
-def test_answers_of_earlier_sequences_are_not_reused():
-    MEMORIES.clear()
-    checks = ("remembers no answer", "remembers no answer of a sequence")
-    grades = [run_check(check, CachesInChains()).grade for check in checks]
-    assert grades == [Grade.PASS, Grade.FAIL]
+    grade, message = run_check("remembers no answer", kind())
+    assert grade is Grade.PASS, message
 
 
 @pytest.mark.parametrize("check", [c for c in CHECKS if c != OPTIONS])
