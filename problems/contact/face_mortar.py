@@ -44,7 +44,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
-from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.mortar import Basis
@@ -207,6 +206,8 @@ def _facing(slave: Simplices, master: Simplices, reach: Reach) -> tuple[Nodes, N
     moved repeatedly by a lower bound on its distance from the master until it is close
     to the centre of a master face.
     """
+    from scipy.spatial import KDTree  # takes 0.1 s
+
     tree = KDTree(master.centre)
     near = slave.radius + master.radius.max()
     limit = reach.max_distance(slave.surface, master.surface) + near

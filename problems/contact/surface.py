@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_areas
@@ -41,6 +40,9 @@ _TRIANGLE = _CORNERS[:3]
 #: distance, relative to the radius of a facet, is below this value; closest points
 #: within this distance, in barycentric coordinates, of a vertex are moved to the vertex
 SAME_POINT = 1e-9
+#: number of pairs of points and facets up to which all are compared, because the import
+#: of a search tree takes 0.1 s
+MAX_PAIRS = 10**5
 #: relative tolerance for rounding of distances
 ROUNDING = 1e-12
 
@@ -331,18 +333,26 @@ def closest_points(x: Points, side: Simplices) -> ClosestPoints:
 
     If several facets are equally close up to rounding, the first one is selected.
     """
-    tree = KDTree(side.centre)
     # `nearest` is the distance to the closest centre of a facet. Facets contain their
     # centres, so the distance to the closest point is at most `nearest`. The distance
     # to the centre of the facet that contains this point is larger by at most the
     # radius of the facet
-    nearest, _ = tree.query(x)
-    reach = nearest * (1 + SAME_POINT) + side.radius.max()
-    found = tree.query_ball_point(x, reach, return_sorted=True)
-    candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
+    if len(x) * len(side.centre) <= MAX_PAIRS:
+        apart = np.linalg.norm(x[:, None] - side.centre, axis=2)
+        nearest = apart.min(axis=1)
+        reach = nearest * (1 + SAME_POINT) + side.radius.max()
+        near, candidate = np.nonzero(apart <= reach[:, None])
+    else:
+        from scipy.spatial import KDTree
+
+        tree = KDTree(side.centre)
+        nearest, _ = tree.query(x)
+        reach = nearest * (1 + SAME_POINT) + side.radius.max()
+        found = tree.query_ball_point(x, reach, return_sorted=True)
+        candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
+        near = np.repeat(np.arange(len(x)), [len(k) for k in found])
     t, pair = side.of_facets(candidate)
-    count = np.array([len(k) for k in found])
-    node = np.repeat(np.arange(len(x)), count)[pair]
+    node = near[pair]
     coordinates = closest_in_simplices(x[node], side.vertices[t])
     at = np.einsum("pv,pvx->px", coordinates, side.vertices[t])
     distance = np.linalg.norm(at - x[node], axis=1)

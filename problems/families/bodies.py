@@ -13,7 +13,6 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.sparse import vstack
-from scipy.spatial import KDTree
 from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
 from mortarbench.harness import Case, InputError, Reference
@@ -318,6 +317,8 @@ def contact_remarks(family: MeshedBodies) -> tuple[str, ...]:
 
 def mesh_remarks(family: MeshedBodies) -> tuple[str, ...]:
     """Return remarks on cracks, folded contact faces, and cells that are too stiff."""
+    from scipy.spatial import KDTree  # takes 0.1 s
+
     whole = family.bodies()
     mesh, remarks = whole.mesh, list[str]()
     nodes = np.unique(boundary_facets(mesh.cells, mesh.dim))

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
+from mortarbench.problems.contact import surface as module
 from mortarbench.problems.contact.mortar import facing_segments
 from mortarbench.problems.contact.surface import Reach, closest_points, divided, surface
+
+
+@pytest.fixture(autouse=True, params=[0, module.MAX_PAIRS], ids=["tree", "pairs"])
+def search(request, monkeypatch):
+    """Search the closest facets by a tree, or among all pairs."""
+    monkeypatch.setattr(module, "MAX_PAIRS", request.param)
 
 
 def all_pairs(x, chain):
