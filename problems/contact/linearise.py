@@ -122,7 +122,8 @@ def _check_facing(
         raise InputError(
             f"contact {name}: no node of the slave side faces its master within reach; "
             "expected two sides that face each other, each with its body on the left "
-            "(in 3D, with outward normals)"
+            "(in 3D, with outward normals), or the normal of a rigid plane towards the "
+            "slave"
         )
 
 

@@ -113,7 +113,6 @@ from mortarbench.problems.contact.rigid import (
     RigidPlane,
     RigidSphere,
 )
-from mortarbench.problems.contact.surface import current_surface
 from mortarbench.problems.fem.elasticity import Material, nodal_masses
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, facet_quadrature
 from mortarbench.problems.fem.mesh_files.named import (
@@ -558,7 +557,6 @@ def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
     if "rigid" in entry:
         with located("rigid"):
             rigid = _rigid(checked.table("rigid", entry["rigid"]), named.dim)
-            _check_faces(named.points, slave, entry["slave"], rigid)
         return ContactPair(slave, slave[:0], rigid, reach)
     if np.intersect1d(slave, sides["master"]).size:
         raise InputError(
@@ -636,27 +634,6 @@ def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:
     if "axis" in vectors:
         return RigidCylinder(vectors["centre"], vectors["axis"], radius)
     return RigidSphere(vectors["centre"], radius)  # in 2D a cylinder
-
-
-def _check_faces(
-    points: NDArray[np.float64], slave: Nodes, name: str, rigid: RigidBody
-) -> None:
-    """Raise InputError if a slave side does not face a rigid body or is far from it."""
-    side = current_surface(points, np.zeros(points.size), slave, "slave")
-    gap, normal = rigid.gap(side.x[side.facets].mean(axis=1))
-    if not (np.einsum("fx,fx->f", normal, side.normal) < 0).any():
-        raise InputError(
-            f"no part of slave {name!r} faces the rigid body; expected a plane whose "
-            "normal points towards the slave, or a sphere or cylinder whose centre is "
-            "in front of the slave"
-        )
-    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    if gap.min() > extent:
-        raise InputError(
-            f"the rigid body is {gap.min():.3g} m from slave {name!r}, farther than "
-            f"the size {extent:.3g} m of the mesh; expected lengths in m for any "
-            "length_unit"
-        )
 
 
 def _sides(entries: list[dict[str, Any]]) -> list[tuple[str, str]]:

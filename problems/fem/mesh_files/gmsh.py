@@ -45,7 +45,6 @@ _WORDS = {
         _LINEAR.format(3),
     ),
 }
-_SAVED = "only physical groups: Mesh.SaveAll = 0"
 #: names and numbers of nodes of gmsh's element types
 _TYPES = {
     1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4),
@@ -69,11 +68,6 @@ def read_msh_sets(path: Path) -> FileMesh:
         nodes that are not in the file.
 
     """
-    if path.suffix.lower() == ".geo":
-        raise InputError(
-            f"{path}: a drawing, not a mesh; generate a mesh first: "
-            f"gmsh -2 {path.name} writes {path.with_suffix('.msh').name}"
-        )
     data = content(path, "a .msh file", copies=_PARSER_FACTOR)
     room = _PARSER_FACTOR * len(data)
     with parsing(path, "not a .msh file of format 2.2 or 4.1, or damaged", room):
@@ -239,7 +233,6 @@ def _file_mesh(
         names[int(tag[0]), int(tag[1])] = name.strip().strip('"')
     tables = defaultdict[str, list[Nodes]](list)
     sets: Any = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
-    is_all = False
     for kind, cells, groups in blocks:
         dim, first = DIMENSION.get(kind, -1), sum(map(len, tables[kind]))
         tables[kind].append(cells)
@@ -248,11 +241,6 @@ def _file_mesh(
             if (dim, number) in names:
                 rows = first + np.arange(len(cells))
                 sets[dim][names[dim, number]][kind].append(rows)
-        is_all = is_all or not any(groups)
-    # in a file with named groups, cells without a group show that the file was saved
-    # with Mesh.SaveAll = 1; without this option, gmsh omits entities without a physical
-    # group if any group exists
-    more = f"; or, if they belong to no body, save {_SAVED}" * (is_all and bool(names))
     return FileMesh(
         path=path,
         points=points,
@@ -268,10 +256,7 @@ def _file_mesh(
             for dim, named in sets.items()
         },
         node_sets={},
-        vocabulary={
-            dim: words._replace(naming=words.naming + more)
-            for dim, words in _WORDS.items()
-        },
+        vocabulary=_WORDS,
     )
 
 

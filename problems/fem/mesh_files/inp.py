@@ -56,17 +56,6 @@ _FAMILIES = {
     **dict.fromkeys(("T2D", "T3D", "R2D"), 1),
 }
 _TYPE = re.compile(r"([A-Z]+(?:[23]D)?)(\d+)[A-Z]*\d?")
-#: descriptions of element types without a counterpart, by the start of their names
-_OTHERS = {
-    "CAX": "an axisymmetric element",
-    "SAX": "an axisymmetric shell",
-    "MASS": "a point mass",
-    "SPRING": "a spring",
-    "CONN": "a connector",
-    "COH": "a cohesive element",
-    "B2": "a beam",
-    "B3": "a beam",
-}
 #: corners of the faces S1, S2, … of the cells of each kind, counted from 0
 _FACES: Mapping[str, Sequence[Sequence[int]]] = {
     "triangle": ((0, 1), (1, 2), (2, 0)),
@@ -527,11 +516,9 @@ def _kind(name: str, line: int) -> str:
     dim = _FAMILIES.get(match[1], -1) if match else -1
     kind = KINDS.get((dim, int(match[2]) if match else 0))
     if kind is None:
-        what = [text for start, text in _OTHERS.items() if upper.startswith(start)]
         raise InputError(
-            f"line {line}: elements of type {shortened(name)}"
-            f"{f', {what[0]}' if what else ''}; expected elements of first order: "
-            f"{_WORDS.linear}"
+            f"line {line}: elements of type {shortened(name)}; expected elements of "
+            f"first order: {_WORDS.linear}"
         )
     return kind
 

@@ -17,7 +17,6 @@ from mortarbench.problems.fem.mesh_files.named import (
 
 _READERS = {
     ".msh": read_msh_sets,
-    ".geo": read_msh_sets,
     ".inp": read_inp,
     ".med": read_med,
 }

@@ -666,7 +666,7 @@ def test_all_entities_may_be_saved_if_every_body_has_a_name(tmp_path, writer):
 
 
 @pytest.mark.parametrize("writer", SAVED)
-def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer):
+def test_cells_that_are_saved_without_a_name_are_refused(tmp_path, writer):
     points, cells = square()
     contents = points, {"a": cells[:1], "": cells[1:]}, {"m": [[7, 8]]}, {}
     (tmp_path / "m.msh").write_text(writer(*contents))
@@ -675,19 +675,8 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
 
     assert str(e.value).endswith(
         "m.msh: 3 cells without a name; expected a name for each: "
-        'Physical Surface("NAME") in the .geo file; or, if they belong to no body, '
-        "save only physical groups: Mesh.SaveAll = 0"
+        'Physical Surface("NAME") in the .geo file'
     )
-
-
-def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
-    text = described(toml=TOML.replace("two.msh", "two.geo"))
-    Path("two.geo").write_text("Point(1) = {0, 0, 0};\n")
-    with refused(
-        "two.geo: a drawing, not a mesh; generate a mesh first: "
-        "gmsh -2 two.geo writes two.msh"
-    ):
-        built(f"{text}/dual")
 
 
 def test_a_set_of_two_parts_becomes_two_bodies(tmp_path):
