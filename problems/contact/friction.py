@@ -137,20 +137,12 @@ def coulomb_fixed_point(
     Raises
     ------
     InputError
-        If the iteration does not converge, or if `normal` raises ArithmeticError
-        because no equilibrium exists for a bound.
+        If the iteration does not converge.
 
     """
     iterates, residuals, friction = list[Friction](), list[float](), first
     while len(iterates) < MAX_ITERATES:
-        try:
-            forces = normal(friction)
-        except ArithmeticError as e:
-            raise InputError(
-                f"load step {step}: no equilibrium was found with bound "
-                f"{len(iterates) + 1} of Coulomb's law ({e}): friction cannot hold the "
-                "load; expected additional supports, or a larger mu"
-            ) from None
+        forces = normal(friction)
         residuals.append(friction.residual(forces))
         if residuals[-1] <= FIXED_POINT_TOLERANCE:
             return [*iterates, friction]

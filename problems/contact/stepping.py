@@ -22,7 +22,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from mortarbench.harness import Friction, Solution, Vector
+from mortarbench.harness import Friction, InputError, Solution, Vector
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
     coulomb_fixed_point,
@@ -176,10 +176,10 @@ class LoadPath(Generic[P]):
     Raises
     ------
     ArithmeticError
-        If a reference solution is not accurate enough.
+        If a reference solution without friction is not accurate enough.
     InputError
-        If the fixed-point iteration for Coulomb's law does not converge, or reaches
-        bounds for which no equilibrium exists.
+        If the fixed-point iteration for Coulomb's law does not converge, or no
+        equilibrium was found for a friction bound.
 
     """
 
@@ -228,15 +228,28 @@ class LoadPath(Generic[P]):
 
 def _fixed_point(linearised: P, stage: Stage) -> list[Iterate[P]]:
     """Return the iterates for Coulomb's law, or the single iterate of other laws."""
+
+    def solve(friction: Friction, start: Solution | None = None) -> Solution:
+        try:
+            return linearised.solve(friction, start)
+        except ArithmeticError as e:
+            if not friction.bound.size:
+                raise
+            raise InputError(
+                f"load step {stage.step}: no equilibrium was found ({e}): friction "
+                "cannot hold the load; expected additional supports, or a larger bound "
+                "or mu"
+            ) from None
+
     if not any(law.mu for law in stage.laws):
         first = linearised.friction
-        return [Iterate(linearised, first, cache(lambda: linearised.solve(first)))]
+        return [Iterate(linearised, first, cache(lambda: solve(first)))]
     solutions = list[Solution]()
 
     def normal(friction: Friction) -> Vector:
         # bounds change little between iterates, so start from the last solution
         start = solutions[-1] if solutions else None
-        solutions.append(linearised.solve(friction, start))
+        solutions.append(solve(friction, start))
         return linearised.normal_multipliers(solutions[-1])
 
     def constant(s: Solution) -> Callable[[], Solution]:

@@ -91,17 +91,6 @@ def test_slow_convergence_ends_after_a_thousand_problems():
     assert len(calls) == 1000
 
 
-def test_a_bound_without_equilibrium_is_named():
-    def normal(one):
-        if one.bound > 2:
-            raise ArithmeticError("no optimal point")
-        return FORCE - one.bound
-
-    with pytest.raises(InputError, match=r"step 3: no equilibrium.* bound 2 of") as e:
-        coulomb_fixed_point(friction(0.5, 1.0), normal, step=3)
-    assert "of Coulomb's law (no optimal point): friction cannot" in str(e.value)
-
-
 def test_a_law_reads_only_its_own_parameter():
     keys = {"bound": 5.0, "mu": 0.3}
 
