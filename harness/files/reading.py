@@ -15,6 +15,7 @@ that states where the error is and what was expected.
 from __future__ import annotations
 
 import os
+import re
 import stat
 import sys
 import tomllib
@@ -33,6 +34,12 @@ from mortarbench.harness.limits import limit_of
 MAX_TOML_MIB = 1  #: limit for TOML files; a file of this size takes 1 s to parse
 MAX_JSON_MIB = 64  #: limit for other text files
 MAX_LEVELS = 50  #: largest depth of nesting
+#: A dotted TOML key with more than `MAX_LEVELS` components. Such a key is rejected
+#: before parsing, since the parser's time is quadratic in the number of components.
+_LONG_KEY = re.compile(
+    r"""(?<![\w"'.-])[\w"'-]++(?:[ \t]*+\.[ \t]*+[\w"'-]++)"""
+    f"{{{MAX_LEVELS}}}"
+)
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
 DEFAULT_MIB = 2048
@@ -138,6 +145,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 def toml(text: str) -> dict[str, Any]:
     """Parse a TOML document."""
     try:
+        if _LONG_KEY.search(text):
+            raise RecursionError
         table = tomllib.loads(text)
         _refuse_deep(table)
     # message such as "Expected … (at line 3, column 5)"

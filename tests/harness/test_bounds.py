@@ -129,6 +129,8 @@ def test_two_contradictory_lines_on_one_measurement_are_refused(journal):
         ("a = " + "[" * 5000, "nested too deeply; expected at most"),
         ("a = " + "[" * 200 + "]" * 200, "nested too deeply"),
         ("a = " + "{a=" * 3000, "nested too deeply"),
+        ("a" + ".a" * 200_000 + " = 1", "nested too deeply"),
+        ("[" + "a." * 200_000 + "a]", "nested too deeply"),
         ("a = " + "9" * 5000, "too many digits; expected at most 4300"),
         ("a = 1e", "line 1, column"),
     ],
