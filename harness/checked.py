@@ -169,16 +169,3 @@ def names(where: str, kind: str, value: object, known: Sequence[str]) -> list[st
         if name not in known:
             raise unknown(kind, name, known, where=where)
     return [*listed]
-
-
-def flag(where: str, value: object) -> bool:
-    """Check that `value` is True, False, 0 or 1, and return it as a bool."""
-    if not isinstance(value, int) or value not in (0, 1):
-        raise InputError(f"{where} = {shown(value)}; expected True or False")
-    return bool(value)
-
-
-def function(where: str, value: object) -> None:
-    """Raise `InputError` unless `value` is callable."""
-    if not callable(value):
-        raise InputError(f"{where} = {shown(value)}; expected a function")

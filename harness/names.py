@@ -197,9 +197,6 @@ def _needed(family: Family, given: dict[str, Value]) -> dict[str, Value]:
     keys = keys_of(type(family))
     needed = {k: v for k, v in given.items() if k == "path" or v != keys[k].default}
     derived = [k for k in needed if keys[k].default is None and k != "path"]
-    basic = {k: v for k, v in needed.items() if k not in derived}
-    if derived and _is_equal(family, basic):
-        return basic
     for key in derived:
         fewer = {k: v for k, v in needed.items() if k != key}
         if _is_equal(family, fewer):

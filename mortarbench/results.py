@@ -214,7 +214,6 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
 
     """
     path = checked.path("folder", folder)
-    checked.function("warn", warn)
     records = read_journal(path, warn)
     if not records:
         raise InputError(f"{path}: no measurements; expected a result folder of `run`")
@@ -258,7 +257,6 @@ def merge(
 
     sources = [checked.result_folder("folders", folder) for folder in folders]
     target = checked.path("out", out)
-    checked.function("tell", tell)
     records = merge_folders(sources, target, tell)
     return Results(folder=target, records=tuple(records))
 
@@ -344,7 +342,6 @@ def run(
         path = registries.suite_path(suite)
         file = read_suite(path)
     folder = folder or Path("out") / file.name
-    fresh = checked.flag("fresh", fresh)
     if folder.is_dir():
         refuse_links(folder)
     changes = {
@@ -361,7 +358,7 @@ def run(
     with located(f"{path}"):
         asked = expanded(file, path.parent, families, known)
     if patterns:
-        chosen = asked.cases.selected(patterns, families)
+        chosen = asked.cases.selected(patterns)
         asked = replace(asked, cases=chosen)
     specs = selected(asked.solvers, solvers, known) if solvers else asked.solvers
     asked = replace(asked, solvers=sweep(specs, options, known))

@@ -94,7 +94,6 @@ def validate(
 
     """
     path = checked.result_folder("folder", folder)
-    checked.function("progress", progress)
     if not checked.is_number(budget) or not budget >= 0:  # `not ≥` also rejects NaN
         raise InputError(f"budget = {shown(budget)}; expected a number of seconds ≥ 0")
     registries = load_registries(plugins, registries)
@@ -209,7 +208,6 @@ def test_solver(
         with checked.located("solver"):
             check_solver(solver)
     checked.positive("time_limit", time_limit)
-    checked.function("progress", progress)
     registries = load_registries(plugins) if registries is None else registries
     name = solver if isinstance(solver, str) else type(solver).__name__
     spec = SolverSpec(name=name, label=name)

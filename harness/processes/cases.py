@@ -42,7 +42,6 @@ from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.verdicts import certified, note_of, quantities_of
 
-MAX_STORED_BOUNDS = 10_000  #: largest number of points whose error bounds are cached
 #: The first dual case of a process is built again if its build took less than this
 #: time, in s. Effects of first calls (page faults, caches, late imports) took 12 of the
 #: 14 ms of dualising the smallest demo case, and imports alone may take a second.
@@ -122,8 +121,6 @@ class Cases:
             bounds, objection = self._bounds[key]
             known = {k: v for k, v in bounds.items() if k != "certify_seconds"}
             return known, objection
-        while len(self._bounds) >= MAX_STORED_BOUNDS:
-            del self._bounds[next(iter(self._bounds))]
         self._bounds[key] = certified(case, s)
         return self._bounds[key]
 
@@ -133,6 +130,7 @@ class Cases:
         while len(self._cases) >= keep:
             del self._cases[next(iter(self._cases))]
         if case is None:
+            self._bounds.clear()
             case = self._build(name)
             if not self._warm and case.dualise_seconds is not None:
                 self._warm = True

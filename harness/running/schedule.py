@@ -57,8 +57,8 @@ class Schedule:
     def add(self, record: Record) -> None:
         """Take a measurement in the journal into account.
 
-        A solver that hit a limit is not measured on the later cases of a line of the
-        grid (`Cases.lines`) along which the number of variables grew up to this case.
+        A solver that hit a limit on a case is not measured on cases in which integer
+        keys are larger, if the number of variables grew with these keys up to the case.
         """
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
@@ -67,14 +67,21 @@ class Schedule:
         if record.status is Verdict.DECLINED:
             self._declined.add((record.solver, _cell(record)))
         if record.status in LIMITS and record.mode == "cold":
-            for line in self.suite.cases.lines:
-                if record.case not in line[1:]:
-                    continue
-                place = line.index(record.case)
-                size, smaller = map(self._variables.get, line[place::-1][:2])
-                if size and smaller and size > smaller:
-                    cells = ((record.mode, c, record.tol) for c in line[place + 1 :])
-                    self._beyond.update((record.solver, cell) for cell in cells)
+            size, params = self._variables.get(record.case, 0), record.params
+            alike = [
+                c
+                for c in self.suite.cases.cold
+                if (c.family_name, c.form) == (record.family, record.form)
+            ]
+            growing = {
+                larger_keys(c.params, params)
+                for c in alike
+                if self._variables.get(c.name, size) < size
+            }
+            for c in alike:
+                if larger_keys(params, c.params) in growing - {frozenset()}:
+                    cell = (record.mode, c.name, record.tol)
+                    self._beyond.add((record.solver, cell))
 
     def is_settled(self, record: Record) -> bool:
         """Return True if a measurement is in the journal, or is not needed.
@@ -157,3 +164,16 @@ class Schedule:
 
 def _cell(record: Record) -> Cell:
     return record.mode, record.case, record.tol
+
+
+def larger_keys(
+    smaller: Mapping[str, Any], larger: Mapping[str, Any]
+) -> frozenset[str]:
+    """Return the keys that differ, if all are integers that are larger in `larger`.
+
+    Otherwise, the set is empty.
+    """
+    pairs = {k: (v, larger.get(k)) for k, v in smaller.items() if v != larger.get(k)}
+    if all(type(a) is type(b) is int and a < b for a, b in pairs.values()):
+        return frozenset(pairs)
+    return frozenset()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from glob import escape, glob
@@ -17,7 +16,7 @@ from msgspec import Meta, Struct
 
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import PLUGINS, InputError, shown, some, unknown
-from mortarbench.harness.names import CaseId, assemble, parse, split_row
+from mortarbench.harness.names import CaseId, assemble, split_row
 from mortarbench.harness.plugin import Family
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]+$")]
@@ -50,8 +49,6 @@ class Cases:
     cold: tuple[CaseId, ...]  #: cases solved without results of other cases
     #: steps of each sequence, in order
     sequences: tuple[tuple[CaseId, ...], ...] = ()
-    #: names of the cold cases along each list of `Problem.params`, in its order
-    lines: tuple[tuple[str, ...], ...] = ()
 
     @property
     def groups(self) -> tuple[tuple[Group, ...], ...]:
@@ -78,12 +75,10 @@ class Cases:
         groups = chain.from_iterable(self.groups)
         return tuple(case for group in groups for case in group.cases)
 
-    def selected(
-        self, patterns: Sequence[str], families: Mapping[str, Family]
-    ) -> Cases:
+    def selected(self, patterns: Sequence[str]) -> Cases:
         """Return the cases that match a pattern, and the sequences with such a case.
 
-        patterns : names of cases, or shell globs over canonical names
+        patterns : shell globs over canonical names
 
         Raises
         ------
@@ -94,11 +89,7 @@ class Cases:
         names = [case.name for case in self.all]
         chosen: set[str] = set()
         for pattern in patterns:
-            canonical = pattern
-            if not set("*?[") & set(pattern):
-                with suppress(InputError):
-                    canonical = parse(pattern, families).name
-            matches = [name for name in names if fnmatchcase(name, canonical)]
+            matches = [name for name in names if fnmatchcase(name, pattern)]
             if not matches:
                 raise InputError(
                     f"cases {pattern!r} matches none of the {len(names)} cases of the "
@@ -122,8 +113,8 @@ def expand_problems(
 ) -> Cases:
     """Return all cases of a suite: single cases and sequences.
 
-    The first key of a grid varies slowest, and forms vary fastest. The cases of a line
-    or of a sequence differ only in one key and in the keys that are zipped with it.
+    The first key of a grid varies slowest, and forms vary fastest. The cases of a
+    sequence differ only in one key and in the keys that are zipped with it.
 
     folder : folder of the suite, to which relative paths refer if they do not exist in
         the working directory
@@ -137,7 +128,6 @@ def expand_problems(
     """
     cold: dict[str, CaseId] = {}
     sequences: dict[tuple[str, ...], tuple[CaseId, ...]] = {}
-    lines: list[tuple[str, ...]] = []
     # number of cases, checked before the cases are created: a grid may span billions
     count = 0
     for number, problem in enumerate(problems):
@@ -147,50 +137,24 @@ def expand_problems(
             family = families[problem.family]
             forms = problem.forms or family.forms
             axes, steps = _axes(problem, _params(problem, folder, family))
-            count += prod(map(len, axes)) * len(forms)
+            count += prod(map(len, axes)) * len(forms) * len(steps)
             if count > most:
                 raise InputError(
                     f"the grid spans {count} cases; expected at most {most} in all; "
                     f"take fewer values, or set max_cases = {count} in the suite"
                 )
-            every, along = _grid(axes, problem.family, family, forms)
-            if steps is None:
-                cold.update((case.name, case) for case in every)
-            for (axis, *_), cases in along.items():
-                names = tuple(case.name for case in cases)
-                if axis == steps:
-                    sequences[names] = tuple(cases)
-                elif steps is None and len(cases) > 1 and "path" not in axes[axis][0]:
-                    lines.append(names)  # files are no series of growing problems
-    return Cases(
-        cold=tuple(cold.values()),
-        sequences=tuple(sequences.values()),
-        lines=tuple(lines),
-    )
-
-
-def _grid(
-    axes: Sequence[Sequence[Mapping[str, Any]]],
-    name: str,
-    family: Family,
-    forms: Sequence[str],
-) -> tuple[list[CaseId], dict[tuple[Any, ...], list[CaseId]]]:
-    """Return the cases of a grid, and the cases along each axis.
-
-    Lists of the second result belong to the number of the axis, the form, and the
-    places on the other axes.
-    """
-    cases: list[CaseId] = []
-    along: dict[tuple[Any, ...], list[CaseId]] = {}
-    for index in product(*(range(len(axis)) for axis in axes)):
-        rows = (axis[i] for axis, i in zip(axes, index, strict=True))
-        point = {key: value for row in rows for key, value in row.items()}
-        for form in forms:
-            cases.append(assemble(name, family, point, form))
-            for axis in range(len(axes)):
-                others = (*index[:axis], *index[axis + 1 :])
-                along.setdefault((axis, form, others), []).append(cases[-1])
-    return cases, along
+            for rows in product(*axes):
+                point = {key: value for row in rows for key, value in row.items()}
+                for form in forms:
+                    group = tuple(
+                        assemble(problem.family, family, point | step, form)
+                        for step in steps
+                    )
+                    if problem.sequence is None:
+                        cold[group[0].name] = group[0]
+                    else:
+                        sequences[tuple(case.name for case in group)] = group
+    return Cases(cold=tuple(cold.values()), sequences=tuple(sequences.values()))
 
 
 def _params(problem: Problem, folder: Path, family: Family) -> dict[str, Any]:
@@ -206,24 +170,21 @@ def _params(problem: Problem, folder: Path, family: Family) -> dict[str, Any]:
 
 def _axes(
     problem: Problem, params: Mapping[str, Any]
-) -> tuple[list[list[dict[str, Any]]], int | None]:
-    """Return the axes of a grid, and the number of the axis of the sequence, or None.
+) -> tuple[list[list[dict[str, Any]]], list[dict[str, Any]]]:
+    """Return the axes of a grid without that of the sequence, and the latter.
 
     An axis is a list of dicts from keys to values. Keys that are zipped belong to the
-    axis of the first of them; any other key has its own axis.
+    axis of the first of them; any other key has its own axis. Without a sequence, its
+    axis is a single empty dict.
     """
     lists = {key: value for key, value in params.items() if isinstance(value, list)}
     keys = [key for group in problem.zip for key in group]
-    for key in keys:
-        if key not in lists or keys.count(key) > 1:
-            raise InputError(
-                f"zip: {shown(key)} is not a list in params, or is paired twice; "
-                'expected groups of such keys, like [["Nr", "Nh"]]'
-            )
-    for group in problem.zip:
-        if len({len(lists[key]) for key in group}) > 1:
-            lengths = ", ".join(f"{key} has {len(lists[key])}" for key in group)
-            raise InputError(f"zip: {lengths} values; expected lists of equal length")
+    lengths = [{len(lists.get(key, ())) for key in group} for group in problem.zip]
+    if len(set(keys)) < len(keys) or any(len(n) > 1 or 0 in n for n in lengths):
+        raise InputError(
+            f"zip = {shown([*map(list, problem.zip)])}; expected groups of different "
+            'keys whose lists in params have equal lengths, such as [["Nr", "Nh"]]'
+        )
     sequence = problem.sequence
     if sequence is not None and len(lists.get(sequence, ())) < 2:
         hint = f"; the lists are {some(lists)}" if lists else ""
@@ -239,8 +200,9 @@ def _axes(
             raise InputError(f"params.{key} is empty; expected at least one entry")
         rows = zip(*columns, strict=True)
         axes[together] = [dict(zip(together, row, strict=True)) for row in rows]
-    steps = [number for number, group in enumerate(axes) if sequence in group]
-    return [*axes.values()], steps[0] if steps else None
+    steps = next((group for group in axes if sequence in group), ())
+    along = axes.pop(steps, [{}])
+    return [*axes.values()], along
 
 
 def _expanded(paths: object, folder: Path, family: Family) -> object:

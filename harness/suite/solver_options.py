@@ -156,14 +156,14 @@ def sweep(
                     used.add(full)
             options = {**spec.options, **axes}
             variants += grid(replace(spec, options=options), registry)
+        known = {
+            f"{spec.label}.{key}" if "." in full else key
+            for full in given
+            for spec in specs
+            for key in known_options(resolve(spec, registry))
+        }
         for full in given.keys() - used:
-            solver, _, key = full.rpartition(".")
-            chosen = [s for s in specs if solver in ("", s.label, s.name)]
-            if not chosen:
-                raise unknown("solver", solver, [s.label for s in specs])
-            names = {k for s in chosen for k in known_options(resolve(s, registry))}
-            where = solver or (specs[0].name if len(specs) == 1 else "")
-            raise unknown("option", key, names, where=where)
+            raise unknown("option", full, known)
         return distinct(variants or specs)
 
 

@@ -17,6 +17,7 @@ from tests.support.suites import suite_of
 class Squares(Family):
     forms: ClassVar = ("p",)
     n: int = 1
+    kind: str = "soft"
 
     def build(self, form, reference):
         raise AssertionError("it is only named, never run")
@@ -121,7 +122,7 @@ def test_beyond_a_limit_only_larger_cases_are_skipped(sizes, last):
     """
     cases = cases_of(*range(1, len(sizes) + 1))
     names = [case.name for case in cases]
-    schedule = schedule_of(cases=cases, lines=(tuple(names),))
+    schedule = schedule_of(cases=cases)
     made = Counter()
     for block in schedule.blocks():
         for (record,) in block.turns:
@@ -140,12 +141,11 @@ def test_beyond_a_limit_only_larger_cases_are_skipped(sizes, last):
 
 
 def test_a_limit_at_one_setting_does_not_skip_another_setting():
-    """The lines n = 1, 2, 3 of two settings are independent, as are tolerances."""
-    cases = cases_of(1, 2, 3, 4, 5, 6)
+    """The sizes n = 1, 2, 3 of two kinds are independent, as are tolerances."""
+    hard = [assemble("f", Squares(), {"n": n, "kind": "hard"}, "p") for n in (1, 2, 3)]
+    cases = (*cases_of(1, 2, 3), *hard)
     names = [case.name for case in cases]
-    schedule = schedule_of(
-        cases=cases, lines=(tuple(names[:3]), tuple(names[3:])), tolerances=(1e-3, 1e-6)
-    )
+    schedule = schedule_of(cases=cases, tolerances=(1e-3, 1e-6))
     made = Counter()
     for block in schedule.blocks():
         for (record,) in block.turns:

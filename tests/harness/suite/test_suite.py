@@ -6,7 +6,6 @@ from typing import Annotated, ClassVar
 
 import pytest
 
-import mortarbench as mb
 from mortarbench import problems, solvers
 from mortarbench.harness import InputError, Range
 from mortarbench.harness.plugin import Family
@@ -167,12 +166,11 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         (MINIMAL + BLOCK + "params = { n = [2, 0] }", "problems[1]: well: n=0 must be"),
         (
             MINIMAL + "zip = [['n', 'n']]\nparams = { n = [2, 3] }",
-            "problems[0]: zip: 'n' is not a list in params, or is paired twice; "
-            "expected",
+            "problems[0]: zip = [['n', 'n']]; expected groups of different keys",
         ),
         (
             MINIMAL + "zip = [['n', 'm']]\nparams = { n = [2, 3], m = [2, 3, 4] }",
-            "problems[0]: zip: n has 2, m has 3 values; expected lists of equal length",
+            "problems[0]: zip = [['n', 'm']]; expected groups of different keys",
         ),
         (
             HEAD + "[[problems]]\nfamily = 'wall'",
@@ -228,7 +226,7 @@ def test_solvers_are_chosen_by_label_or_added_by_name(demo):
 
 def test_patterns_choose_cases_in_the_suite_s_order(demo):
     patterns = ["*/n=12/*", "well/n=2/dual", "*/n=12/dual"]
-    chosen = demo.cases.selected(patterns, FAMILIES).cold
+    chosen = demo.cases.selected(patterns).cold
 
     assert [case.name for case in chosen] == [
         "well/n=2/dual", "well/n=12/primal", "well/n=12/dual"
@@ -238,7 +236,7 @@ def test_patterns_choose_cases_in_the_suite_s_order(demo):
 @pytest.mark.parametrize("pattern", ["well", "x*", "*/N=2/*", "well/n=2"])
 def test_a_pattern_without_cases_is_refused(demo, pattern):
     with pytest.raises(InputError, match="matches none of the 4 cases of the suite"):
-        demo.cases.selected(["*", pattern], FAMILIES)
+        demo.cases.selected(["*", pattern])
 
 
 def shipped(name):
@@ -320,34 +318,6 @@ def test_a_sequence_along_no_list_is_refused(tmp_path, key):
     )
     with pytest.raises(InputError, match=r"problems\[0\]: sequence = "):
         load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
-
-
-def test_lines_of_a_grid_differ_in_one_list_only(load):
-    suite = load(
-        MINIMAL
-        + 'forms = ["dual"]\nparams = { n = [2, 4, 8], kind = ["soft", "hard"] }'
-    )
-    soft = tuple(f"well/n={n}/dual" for n in (2, 4, 8))
-    hard = tuple(f"well/n={n}/kind=hard/dual" for n in (2, 4, 8))
-
-    assert {soft, hard} < set(suite.cases.lines)
-    assert set(suite.cases.lines) - {soft, hard} == set(zip(soft, hard, strict=True))
-    assert load(MINIMAL).cases.lines == ()
-
-
-def test_files_in_a_list_are_no_series_of_growing_problems(tmp_path):
-    """A limit on one file must not skip other files."""
-    for n in (10, 20):
-        mb.export(f"string/n={n}/primal", tmp_path / f"{n}.npz")
-    file = tmp_path / "files.toml"
-    file.write_text(
-        'name = "files"\nsolvers = ["osqp"]\n[[problems]]\nfamily = "file"\n'
-        'params = { path = "*.npz" }\n'
-    )
-    suite = load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
-
-    assert len(suite.cases.cold) == 2
-    assert suite.cases.lines == ()
 
 
 def test_a_list_among_the_options_spans_a_grid_of_labelled_solvers(load):
