@@ -97,7 +97,7 @@ def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
     """
     room += _PARSER_BYTES
     try:
-        with warnings.catch_warnings(), _at_most(room):
+        with warnings.catch_warnings(), at_most(room):
             warnings.simplefilter("error")
             yield
     except InputError:
@@ -112,7 +112,7 @@ def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
 
 
 @contextmanager
-def _at_most(size: int) -> Iterator[None]:
+def at_most(size: int) -> Iterator[None]:
     """Limit the growth of the address space of this process to `size` bytes."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text().split()[0])

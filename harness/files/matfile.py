@@ -21,8 +21,8 @@ from scipy.sparse import csc_array, issparse
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.datafile import content
 from mortarbench.harness.files.durable import writing
-from mortarbench.harness.files.isolated import read_isolated
 from mortarbench.harness.files.qpfile import VECTORS, explicit_matrices
+from mortarbench.harness.files.reader import read_isolated
 from mortarbench.harness.qp import QP
 from mortarbench.harness.sets.arrays import set_arrays
 

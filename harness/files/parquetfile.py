@@ -30,12 +30,12 @@ from scipy.sparse import issparse
 
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import writing
-from mortarbench.harness.files.isolated import read_isolated
 from mortarbench.harness.files.qpfile import (
     explicit_matrices,
     malformed,
     qp_of,
 )
+from mortarbench.harness.files.reader import read_isolated
 from mortarbench.harness.files.reading import opened
 from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.sets.arrays import SET_ARRAY, set_arrays

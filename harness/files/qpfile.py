@@ -300,28 +300,12 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
     if {indices.dtype.kind, indptr.dtype.kind, shape.dtype.kind} - set("iu"):
         raise ValueError(f"{name}_indices, _indptr and _shape must contain integers")
     try:
-        return compressed(data, indices, indptr, tuple(shape.tolist()))
+        # Compare neighbouring entries, since SciPy (1.17.1) computes the differences of
+        # indptr, which may overflow.
+        if (indptr[1:] < indptr[:-1]).any():
+            raise ValueError("indptr decreases")
+        M = csc_array((data, indices, indptr), shape=tuple(shape.tolist()))
+        M.check_format(full_check=True)  # an index out of range would crash a product
     except (ValueError, TypeError, OverflowError) as e:
         raise ValueError(f"{name} is not a matrix in CSC parts: {e}") from None
-
-
-def compressed(
-    data: NDArray[Any], indices: NDArray[Any], indptr: NDArray[Any], shape: Any
-) -> Matrix:
-    """Check CSC parts, and return the matrix that they define.
-
-    An index out of range would crash a matrix-vector product.
-
-    Raises
-    ------
-    ValueError, TypeError, OverflowError
-        If the parts are inconsistent with each other or with `shape`.
-
-    """
-    # Compare neighbouring entries, since SciPy (1.17.1) computes the differences of
-    # indptr, which may overflow.
-    if (indptr[1:] < indptr[:-1]).any():
-        raise ValueError("indptr decreases")
-    M = csc_array((data, indices, indptr), shape=shape)
-    M.check_format(full_check=True)
     return canonical(M)

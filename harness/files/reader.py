@@ -1,14 +1,13 @@
-"""Separate process for reading .mat and Parquet files.
+"""Reading of .mat and Parquet files in a separate process.
 
 Damaged files can crash the readers of SciPy and Arrow, and small files can declare huge
 data::
 
-    python reader.py MAX_BYTES mat < FILE > NPZ
-    python reader.py MAX_BYTES parquet KEY PATTERN ROW COLUMN... < FILE > NPZ
+    python -m mortarbench.harness.files.reader MAX_BYTES mat < FILE > NPZ
+    python -m mortarbench.harness.files.reader MAX_BYTES parquet KEY PATTERN ROW COLUMN…
 
-Exit codes other than 0 mean that the file is damaged or, with `TOO_LARGE`, that its
-data take more than MAX_BYTES. To start quickly, the process imports no other module of
-this package.
+Exit codes other than 0 mean that the file is damaged or, with `_TOO_LARGE`, that its
+data take more than MAX_BYTES.
 """
 
 from __future__ import annotations
@@ -18,21 +17,67 @@ import json
 import os
 import re
 import resource
+import subprocess
 import sys
 import warnings
-import zipfile
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-CPU_SECONDS = 60  #: CPU time after which the kernel kills this process
-#: number of bytes of address space in addition to a multiple of the size of the data
-ROOM = 2**29
-TOO_LARGE = 3  #: exit code if the data exceed the limit
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.datafile import at_most
+from mortarbench.harness.files.npz import arrays_in
+from mortarbench.harness.files.reading import MIB, VARIABLE, max_bytes
+
+_CPU_SECONDS = 60  #: CPU time after which the kernel kills the process
+_ROOM = (
+    2**29
+)  #: address space in addition to a multiple of the largest size of the data
+_TOO_LARGE = 3  #: exit code if the data exceed the limit
 _PARTS = ("data", "indices", "indptr", "shape")  # of a sparse matrix in an npz file
 
 
-def mat(max_bytes: int) -> dict[str, Any]:
+def read_isolated(
+    file: IO[bytes], path: Path, wrong: str, *arguments: str
+) -> dict[str, NDArray[Any]]:
+    """Read the arrays of a file in a separate process that a damaged file may crash.
+
+    file : open file, from its beginning
+    path : path of the file for messages
+    wrong : message if the file cannot be read
+    arguments : arguments of the process, its limit excepted
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or its data exceed the limit of
+        `harness.files.reading`.
+
+    """
+    most = max_bytes()
+    command = [sys.executable, "-P", "-m", __name__, str(most), *arguments]
+    with TemporaryFile() as archive:
+        done = subprocess.run(
+            command, stdin=file, stdout=archive, stderr=subprocess.DEVNULL, check=False
+        )
+        if done.returncode == _TOO_LARGE:
+            raise InputError(
+                f"{path}: its content would take more than {most // MIB} MiB of "
+                f"memory; expected less (set {VARIABLE} to allow more)"
+            )
+        if done.returncode:
+            raise InputError(f"{path}: {wrong}")
+        archive.seek(0)
+        try:
+            return arrays_in(archive, path)
+        except ValueError:  # damaged names
+            raise InputError(f"{path}: {wrong}") from None
+
+
+def _mat() -> dict[str, Any]:
     """Return the numbers and texts of a .mat file; other variables are left out.
 
     A sparse matrix M is returned as its CSC parts M_data, M_indices, M_indptr, M_shape.
@@ -41,7 +86,6 @@ def mat(max_bytes: int) -> dict[str, Any]:
     from scipy.sparse import issparse
 
     arrays: dict[str, Any] = {}
-    _bound(3 * max_bytes)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # for instance, a variable that occurs twice
         variables = loadmat(io.BytesIO(sys.stdin.buffer.read()), spmatrix=False)
@@ -55,7 +99,7 @@ def mat(max_bytes: int) -> dict[str, Any]:
     return arrays
 
 
-def parquet(
+def _parquet(
     max_bytes: int, key: str, pattern: str, number: str, *wanted: str
 ) -> dict[str, Any]:
     """Return a row of a Parquet file by columns, and a JSON text with the name `head`.
@@ -95,7 +139,6 @@ def parquet(
     size = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
     if size > max_bytes:
         raise MemoryError
-    _bound(4 * size)
     columns = [*wanted, *(name for name in names if re.fullmatch(pattern, name))]
     table = file.read_row_group(at, columns=columns, use_threads=False)
     table.validate(full=True)
@@ -115,31 +158,18 @@ def _numbers(scalar: Any) -> Any:
     return values if values.dtype.kind in "iuf" and values.ndim == 1 else np.zeros(())
 
 
-def _bound(room: int) -> None:
-    """Limit the growth of the address space to `room` bytes and `ROOM`."""
-    with open("/proc/self/statm") as file:
-        used = int(file.read().split()[0]) * resource.getpagesize()
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    limits = [k for k in (soft, hard) if k != resource.RLIM_INFINITY]
-    resource.setrlimit(
-        resource.RLIMIT_AS, (min(used + room + ROOM, *limits, 2**62), hard)
-    )
-
-
 def main(limit: str, kind: str, *arguments: str) -> None:
     """Read the file on standard input, and write its arrays to standard output."""
-    max_bytes = int(limit)
-    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
+    most = int(limit)
+    resource.setrlimit(resource.RLIMIT_CPU, (_CPU_SECONDS, _CPU_SECONDS))
     try:
-        arrays = mat(max_bytes) if kind == "mat" else parquet(max_bytes, *arguments)
-        if sum(array.nbytes for array in arrays.values()) > max_bytes:
+        with at_most(4 * most + _ROOM):
+            arrays = _mat() if kind == "mat" else _parquet(most, *arguments)
+        if sum(array.nbytes for array in arrays.values()) > most:
             raise MemoryError
     except MemoryError:
-        os._exit(TOO_LARGE)
-    with zipfile.ZipFile(sys.stdout.buffer, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as part:
-                np.lib.format.write_array(part, array, allow_pickle=False)
+        os._exit(_TOO_LARGE)
+    np.savez(sys.stdout.buffer, **arrays)
     sys.stdout.flush()
 
 

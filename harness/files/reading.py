@@ -6,10 +6,9 @@ required memory from the headers. If the required memory exceeds the limit, read
 refuse the file before they read the data. The environment variable
 ``MORTARBENCH_MOST_MIB`` sets the limit in MiB; the default is 2048.
 
-A file must be regular, since a device or a pipe may never end. The file must also
-declare its size, which files in /proc do not. A text must be UTF-8, must not
-exceed a limit, and must not be nested too deeply. All functions raise an `InputError`
-that states where the error is and what was expected.
+A file must be regular, since a device or a pipe may never end. A text must be UTF-8,
+must not exceed a limit, and must not be nested too deeply. All functions raise an
+`InputError` that states where the error is and what was expected.
 """
 
 from __future__ import annotations
@@ -86,28 +85,19 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
 
     """
     try:
-        # Check the type before opening, since opening a device may have side effects.
-        regular = stat.S_ISREG(path.stat().st_mode)
-        # opening does not block if a pipe has replaced the file
-        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
-        fd = os.open(path, flags) if regular else -1
+        # without blocking, in case the file is a pipe
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as e:  # a NUL character in the name raises ValueError
         why = e.strerror if isinstance(e, OSError) else "not a valid file name"
         raise InputError(f"{path}: {why}; expected {expected}") from None
-    if not regular or not stat.S_ISREG(os.fstat(fd).st_mode):
-        if fd >= 0:
-            os.close(fd)
-        wrong = "a folder" if path.is_dir() else "a device or a pipe"
+    status = os.fstat(fd)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(fd)
+        wrong = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or a pipe"
         raise InputError(f"{path}: {wrong}; expected {expected}")
     with os.fdopen(fd, "rb") as file:
         try:
-            size = os.fstat(fd).st_size
-            check_size(f"{path}: the file", size)
-            if size == 0 and os.pread(fd, 1, 0):
-                raise InputError(
-                    f"{path}: declares no size, as files in /proc do; "
-                    f"expected {expected}"
-                )
+            check_size(f"{path}: the file", status.st_size)
             yield file
         # Errors with a file name, or about a full disk, concern other files that the
         # block opens or writes.
