@@ -19,6 +19,7 @@ normal to a single chord, so that a solver could turn the disc until an end touc
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,9 @@ MAX_IMBALANCE = 1e-6
 #: components of a motion below this fraction of the largest one are not reported
 _MIN_MOTION = 1e-3
 _AXES = "xyz"
+#: number of sides of polygons around discs; the radius of their corners is
+#: 1/cos(π/16) = 1.02 times that of the disc
+POLYGON = 16
 
 Floats = NDArray[np.float64]
 
@@ -88,6 +92,61 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     )
 
 
+def check_friction(
+    bodies: UnassembledBodies, B: Matrix, friction: Friction, step: int, share: float
+) -> None:
+    """Check that supports, contact and bounded friction can balance the load.
+
+    Otherwise, the primal QP is unbounded below: at points so far away that rounding
+    errors exceed the load, its residuals are small, and the point would be verified.
+
+    A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B, and
+    forces λ_t of the friction rows T with ‖λ_t‖ ≤ g, such that the residual  Zᵀ(f −
+    Bᵀλ_n − Tᵀλ_t)  is zero. A linear program minimises the 1-norm of this residual. In
+    3D, circumscribed polygons with `POLYGON` sides replace the discs. Hence, a load
+    that exceeds the friction bound by less than 2 % may pass this check, although the
+    solve then fails.
+
+    step : number of the load step
+    share : load factor of this step
+
+    Raises
+    ------
+    InputError
+        If no such forces exist. The message states the unbalanced fraction of the load.
+
+    """
+    R = _motions(bodies)
+    allowed = _kernel(bodies.held @ R)
+    if not allowed.shape[1] or not friction.bound.size:
+        return
+    # imported here, because it is rarely needed and slow to import
+    from scipy.optimize import linprog
+
+    motions = R @ allowed
+    forces = np.hstack([(csr_array(M) @ motions).T for M in (B, friction.T)])
+    eye, load = np.eye(allowed.shape[1]), motions.T @ bodies.f * share
+    rows = B.shape[0]
+    limits = [(0, None)] * rows + [(-g, g) for g in friction.bound]
+    size = np.abs(bodies.f).sum() * share
+    sides = _polygons(friction, rows, 2 * len(eye))
+    # unknowns: λ_n, λ_t, and the positive and negative parts of the residual
+    program = linprog(
+        np.append(np.zeros(forces.shape[1]), np.ones(2 * len(eye))),
+        A_eq=np.hstack([forces, eye, -eye]),
+        b_eq=load,
+        **sides,
+        bounds=limits + [(0, None)] * (2 * len(eye)),
+        method="highs",
+    )
+    if program.x is not None and program.fun > MAX_IMBALANCE * size:
+        raise InputError(
+            f"load step {step}: friction cannot hold the load: "
+            f"{program.fun / size:.2%} of the load remains unbalanced within the bound "
+            "of Tresca's law; expected additional supports, or a larger bound"
+        )
+
+
 def least_motion(
     rigid: Floats, primal: QP, s: Solution, friction: Friction
 ) -> Solution:
@@ -117,6 +176,28 @@ def least_motion(
         r = E @ nnls(E, one)[0] - one
         change = -r[:-1] / r[-1]
     return replace(s, x=s.x - M @ (aim + change))
+
+
+def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
+    """Return the rows of polygons around discs, as arguments of `linprog`.
+
+    The result is empty in 2D, where bounds on the unknowns suffice.
+
+    before, after : numbers of other unknowns before and after those of friction
+    """
+    vectors = friction.vectors
+    if vectors.shape[1] == 1:
+        return {}
+    angle = 2 * np.pi * np.arange(POLYGON) / POLYGON
+    sides = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    row = np.arange(len(vectors) * POLYGON).reshape(-1, POLYGON, 1)
+    at = np.broadcast_to(before + vectors[:, None], (len(vectors), POLYGON, 2))
+    values = np.broadcast_to(sides, at.shape)
+    A = csr_array(
+        (values.ravel(), (np.broadcast_to(row, at.shape).ravel(), at.ravel())),
+        shape=(row.size, before + vectors.size + after),
+    )
+    return {"A_ub": A, "b_ub": np.repeat(friction.bound[vectors[:, 0]], POLYGON)}
 
 
 def _motions(bodies: UnassembledBodies) -> Floats:

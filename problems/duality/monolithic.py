@@ -16,6 +16,7 @@ import numpy as np
 
 from mortarbench.harness import QP, Friction, Reference, Solution, Vector
 from mortarbench.harness.verify.kkt import kkt_residuals
+from mortarbench.problems.contact.balance import check_friction
 from mortarbench.problems.contact.bodies import (
     Bodies,
     slave_places,
@@ -164,6 +165,8 @@ def load_path(
         loaded, load = bodies_of(stage), (id(stage.load), id(stage.fixed))
         primal = primal_qp(loaded, rows, stage.part)
         first = friction_of(loaded, rows, stage.laws, at.slip_origin, at.normal_forces)
+        if first.bound.size and not any(law.mu for law in stage.laws):
+            check_friction(loaded, rows.B, first, stage.step, stage.part)
 
         @cache
         def dual() -> Transformed:
