@@ -198,12 +198,7 @@ def check_kinematics(family: Any) -> None:
                     f"{key}, or kinematics=finite"
                 )
         return
-    for key, allowed in LINEAR_ONLY.items():
-        if getattr(family, key, allowed) != allowed:
-            raise InputError(
-                f"{key}={getattr(family, key)} with kinematics=finite is not built; "
-                f"expected {key}={allowed}, or kinematics=linear"
-            )
+    refuse_unbuilt(family, LINEAR_ONLY, "kinematics=finite", "kinematics=linear")
     if (
         getattr(family, "contact_stiffness", "none") == "geometric"
         and family.contact != "nts"
@@ -214,16 +209,19 @@ def check_kinematics(family: Any) -> None:
         )
 
 
-def check_plane_only(family: Any, space: str) -> None:
-    """Raise InputError if a key has a value that 3D families do not support.
+def refuse_unbuilt(
+    family: Any, only: Mapping[str, Any], user: str, remedy: str
+) -> None:
+    """Raise InputError if a key has a value that is not built.
 
-    space : the key and value that make the family three-dimensional, for the message
+    only : the only value that is built, by key
+    user, remedy : key and value with which others are not built, and the alternative
     """
-    for key, only in PLANE_ONLY.items():
-        if getattr(family, key, only) != only:
+    for key, built in only.items():
+        if (value := getattr(family, key, built)) != built:
             raise InputError(
-                f"{key}={getattr(family, key)} with {space} is not built; expected "
-                f"{key}={only}, or a plane problem"
+                f"{key}={value} with {user} is not built; expected {key}={built}, or "
+                f"{remedy}"
             )
 
 

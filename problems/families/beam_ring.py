@@ -56,6 +56,7 @@ from mortarbench.problems.fem.mesh import (
 from mortarbench.problems.keys import (
     CONTACT_FORMS,
     MAX_STEPS,
+    PLANE_ONLY,
     UNSET,
     Basis,
     Bound,
@@ -73,7 +74,7 @@ from mortarbench.problems.keys import (
     Step,
     Steps,
     check_memory,
-    check_plane_only,
+    refuse_unbuilt,
     refuse_unused,
 )
 
@@ -134,7 +135,7 @@ class BeamRing(ContactFamily):
             )
         check_memory((3 * (self.depth + 1) if self.depth else 2) * nodes)
         if self.depth:
-            check_plane_only(self, f"depth={self.depth}")
+            refuse_unbuilt(self, PLANE_ONLY, f"depth={self.depth}", "a plane problem")
         else:
             refuse_unused(self, "sides", "depth=0", "depth=1 or more")
 

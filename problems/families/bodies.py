@@ -49,6 +49,7 @@ from mortarbench.problems.fem.mesh_files.named import place
 from mortarbench.problems.files.file_digest import check_digest
 from mortarbench.problems.keys import (
     CONTACT_FORMS,
+    PLANE_ONLY,
     Basis,
     Bound,
     ContactStiffness,
@@ -65,7 +66,7 @@ from mortarbench.problems.keys import (
     Steps,
     check_decomposition,
     check_friction,
-    check_plane_only,
+    refuse_unbuilt,
 )
 
 #: largest overlap of contact sides that causes no remark, relative to the extent of the
@@ -142,7 +143,7 @@ class MeshedBodies(ContactFamily):
         """Return the bodies; in 3D, no key may have a value for plane bodies."""
         bodies = _bodies(self.path, self.sha256, self.plane)
         if bodies.mesh.dim > 2:
-            check_plane_only(self, "volumes")
+            refuse_unbuilt(self, PLANE_ONLY, "volumes", "a plane problem")
         return bodies
 
     def rows(self) -> ContactRows:
@@ -230,29 +231,19 @@ class MeshedBodies(ContactFamily):
 
     def finite_bodies(self) -> Bodies:
         """Return the assembled bodies; refuse what finite strain does not support."""
-        with located(self.path):
-            if any(law.acts for law in self.laws()):
-                raise InputError(
-                    "friction of a contact with kinematics=finite is not built; "
-                    "expected no friction, or kinematics=linear"
-                )
-            elastic = self.bodies()
-            built = {
-                "prescribed displacements": elastic.lift is None,
-                "springs": elastic.springs is None,
-                "bodies with common nodes": elastic.piece is None,
-            }
-            for what, is_built in built.items():
-                if not is_built:
-                    raise InputError(
-                        f"{what} with kinematics=finite are not built; expected "
-                        "kinematics=linear"
-                    )
-            if any(pair.rigid is not None for pair in elastic.pairs):
-                raise InputError(
-                    "contact with a rigid body and kinematics=finite is not built; "
-                    "expected a master, or kinematics=linear"
-                )
+        elastic = self.bodies()
+        unbuilt = {
+            "friction": any(law.acts for law in self.laws()),
+            "prescribed displacements": elastic.lift is not None,
+            "springs": elastic.springs is not None,
+            "bodies with common nodes": elastic.piece is not None,
+            "rigid bodies": any(pair.rigid is not None for pair in elastic.pairs),
+        }
+        if what := [name for name, is_used in unbuilt.items() if is_used]:
+            raise InputError(
+                f"{self.path}: kinematics=finite with {' and '.join(what)} is not "
+                "built; expected kinematics=linear"
+            )
         return elastic.assembled
 
     def build(self, form: str, reference: Reference) -> Case:

@@ -89,6 +89,7 @@ from mortarbench.problems.keys import (
     CONTACT_FORMS,
     MAX_SIZE,
     MIN_SIZE,
+    PLANE_ONLY,
     POSITIVE,
     Dimension,
     Feti,
@@ -96,7 +97,7 @@ from mortarbench.problems.keys import (
     PlaneState,
     check_decomposition,
     check_memory,
-    check_plane_only,
+    refuse_unbuilt,
     refuse_unused,
 )
 
@@ -711,7 +712,7 @@ class Plate(DecomposedFamily):
         if self.dim == 2:
             refuse_unused(self, "Sz", "dim=2", "dim=3")
         else:
-            check_plane_only(self, "dim=3")
+            refuse_unbuilt(self, PLANE_ONLY, "dim=3", "a plane problem")
 
     @property
     def counts(self) -> tuple[int, ...]:

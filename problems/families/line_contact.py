@@ -77,11 +77,6 @@ class TangentialContact:
         s, p0 = x / self.normal.a, self.mu * self.normal.p0
         return np.asarray(p0 * sum(w / c * _root(s / c) for w, c in self.semicircles))
 
-    def force(self, x: Vector) -> Vector:
-        """Return ∫q from −a to x, N/m."""
-        s, P = x / self.normal.a, self.mu * self.normal.P
-        return np.asarray(P * sum(w * _share(s / c) for w, c in self.semicircles))
-
     def stick_half_width(self, shear: float, pressure: float) -> float:
         """Return the half width c of the stick zone from moments of the tractions, m.
 

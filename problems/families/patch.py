@@ -72,6 +72,7 @@ from mortarbench.problems.fem.mesh import (
 from mortarbench.problems.fem.stress import gauss_stress
 from mortarbench.problems.keys import (
     MIN_STRETCH,
+    PLANE_ONLY,
     POSITIVE,
     UNSET,
     Basis,
@@ -88,7 +89,7 @@ from mortarbench.problems.keys import (
     Newton,
     PlaneState,
     check_memory,
-    check_plane_only,
+    refuse_unbuilt,
     refuse_unused,
 )
 
@@ -139,7 +140,7 @@ class ContactPatch(ContactFamily):
         """Check that every key is used, and that the blocks fit into memory."""
         super().__post_init__()
         if self.dim == 3:
-            check_plane_only(self, "dim=3")
+            refuse_unbuilt(self, PLANE_ONLY, "dim=3", "a plane problem")
         else:
             refuse_unused(self, "distort", "dim=2", "dim=3")
         if self.kinematics == "linear":

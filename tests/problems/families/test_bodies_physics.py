@@ -490,7 +490,7 @@ def test_an_invalid_load_or_support_is_refused_in_one_line(old, new, message):
     ("more", "keys", "message"),
     [
         ('spring = 1e9', "parts=2/dual", "springs on bodies in parts are not built"),
-        ('spring = 1e9', "kinematics=finite/dual", "springs with kinematics=finite"),
+        ('spring = 1e9', "kinematics=finite/dual", "kinematics=finite with springs"),
         ('displacement = [0, 1e-3]', "kinematics=finite/dual", "prescribed displ"),
     ],
 )  # fmt: skip

@@ -213,7 +213,7 @@ def test_the_file_may_request_finite_strain(described):
 def test_friction_of_a_pair_at_finite_strain_is_refused(described):
     name = described(toml=TOML + 'friction = "coulomb"\nmu = 0.3\n')
 
-    with pytest.raises(InputError, match=r"a\.toml: friction of a contact with kine"):
+    with pytest.raises(InputError, match=r"a\.toml: kinematics=finite with friction"):
         built(f"{name}/kinematics=finite/dual")
 
 

@@ -191,7 +191,7 @@ def test_one_side_may_press_on_two_rigid_bodies(tmp_path):
         (IN_PLANE, LINE, DISC.replace("radius", "axis = [0, 1], radius"),
          "rigid: unknown key 'axis'"),
         (IN_PLANE, "steps", 'kinematics = "finite"\nsteps',
-         "a rigid body and kinematics=finite is not built; expected a master, or kin"),
+         "kinematics=finite with rigid bodies is not built; expected kinematics=lin"),
     ],
 )  # fmt: skip
 def test_a_wrong_rigid_body_is_refused_in_one_line(tmp_path, toml, old, new, message):
