@@ -442,10 +442,12 @@ def _evaluated(
         return np.asarray(np.abs(supported.T @ alpha[:p]), dtype=np.float64)
 
     off = None
-    # If û is small, its θ may differ from the θ of the error. For û = 0, θ is 0.
-    if u_u < 4 * d_d:
+    # If û is small, its θ may differ from the θ of the error, and may be the ratio of
+    # two rounding errors if û is a rigid motion.
+    if abs(u_u) < 4 * d_d:
         v = split.spread(motions.without(u))
-        theta = max(theta, split.residual(split.averaged(v - near.d)).theta)
+        of_equilibrium = split.residual(split.averaged(v - near.d)).theta
+        theta = max(theta * min(1.0, abs(u_u) / d_d), of_equilibrium)
         off = split.excess(drift)
     computed, left = _root(d_d), near.left + length(split, noise)
     total, nearest = computed + left, max(computed - left, 0.0)

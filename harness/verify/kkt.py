@@ -108,13 +108,15 @@ def _scaled(qp: QP) -> Scaling:
     a, t = np.log(np.abs(K.data)), np.log(np.where(curved, p, 1))
     count = np.bincount(j, minlength=n)
     w = 1 / np.maximum(count, 1)[j]
-    rows = _nonzero(np.bincount(i, w, K.shape[0]))
-    columns = _nonzero(np.bincount(j, w, n) + 4 * curved)
+    W, Wa = (csr_array((v, (i, j)), shape=K.shape) for v in (w, w * a))
+    rows = _nonzero(W.sum(axis=1))
+    columns = _nonzero(W.sum(axis=0) + 4 * curved)
+    of_rows, of_columns = Wa.sum(axis=1), Wa.sum(axis=0)
     d, r, c = np.zeros(n), np.zeros(K.shape[0]), 0.0
     for _ in range(CURTIS_REID):
-        r = -np.bincount(i, w * (a + d[j]), r.size) / rows
+        r = -(of_rows + W @ d) / rows
         c = -float(np.mean((2 * d + t)[curved])) if curved.any() else 0.0
-        d = -(np.bincount(j, w * (a + r[i]), n) + 2 * (c + t) * curved) / columns
+        d = -(of_columns + W.T @ r + 2 * (c + t) * curved) / columns
         _tie(d, blocks)
     for step in range(1 + RUIZ):
         row = np.full(r.size, -np.inf)

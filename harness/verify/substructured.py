@@ -241,7 +241,8 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
     `size` is the norm of the last correction. If `MAX_REFINEMENTS` corrections do not
     suffice, all of them are added, and the same bound holds.
     """
-    d, size = solved(split, rho)
+    step, size = solved(split, rho)
+    d = step.astype(Real)
     Kd = split.product(d)
     for _ in range(MAX_REFINEMENTS - 1):
         before, rest = size, rho - split.joined(Kd)
@@ -251,18 +252,18 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
         if size <= REFINEMENT_TOLERANCE * np.sqrt(max(float(d @ Kd), 0.0)):
             break
         d += step  # in place, since vectors may be large
-        Kd += split.product(step)
+        Kd += split.product(step.astype(Real))
     return Neighbour(d, Kd, size / (1 - q) if q < 1 else np.inf, unbalanced)
 
 
-def solved(split: Split, force: NDArray[Any]) -> tuple[Extended, float]:
+def solved(split: Split, force: NDArray[Any]) -> tuple[Vector, float]:
     """Return a solution of (5), and its energy norm √(bᵀd).
 
     The norm is the dual norm of the forces (n,) without their part along rigid motions.
     """
     b = split.forces(force)
-    d = split.solve(b).astype(Real)
-    return d, float(np.sqrt(max(b @ d, Real(0))))
+    d = split.solve(b)
+    return d, float(np.sqrt(max(b @ d, 0)))
 
 
 def length(split: Split, force: NDArray[Any]) -> float:
