@@ -279,11 +279,6 @@ class Team:
         self.order("_place", build, placed.number, *numbers, data=parts)
         return placed
 
-    def map(self, work: Callable[[Any], T], parts: Sequence[Any]) -> list[T]:
-        """Return the results of a function of a module for the value of each rank."""
-        results: list[T] = self.order("_map", work, data=parts)
-        return results
-
     def order(self, step: str, *arguments: Any, data: Any = None) -> Any:
         """Execute a step on all ranks; return the result of rank 0.
 
@@ -318,10 +313,6 @@ class Team:
         self._parts[number] = self.comm.together(
             lambda: build(part, *(self._parts[other] for other in others))
         )
-
-    def _map(self, parts: Any, work: Callable[[Any], T]) -> list[T]:
-        part = self.comm.scatter(parts)
-        return self.comm.gather(self.comm.together(lambda: work(part)))
 
     def _call(self, _: None, *call: Any) -> list[Any]:
         return self.comm.gather(self._result(*call))

@@ -326,4 +326,5 @@ def largest_stresses(torn: TornBodies, elastic: UnassembledBodies, u: Vector) ->
             local = (np.cumsum(near) - 1)[selected]
             mesh = points[near], local, u[near], is_inside[near]
             of_rank.append(Patch(*mesh, D[b], material.nu, plane))
-    return np.asarray(np.max(torn.team.map(largest_in_patches, patches), axis=0))
+    largest = torn.team.place(largest_in_patches, patches)
+    return np.asarray(np.max(largest("tolist"), axis=0))

@@ -37,10 +37,6 @@ def numbered(team):
     return team.place(Numbers, [np.full(3, float(r)) for r in range(team.comm.size)])
 
 
-def length(part):
-    return len(part)
-
-
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_parts_lists_and_sums_arrive(size):
     def work(comm):
@@ -69,7 +65,6 @@ def works_together(team):
         ([part.tolist() for part in numbers("scaled", 1.0)],
          [[float(r)] * 3 for r in range(size)]),
         (pairs("others"), [[float(r)] * 3 for r in range(size)]),
-        (team.map(length, ["a" * r for r in range(size)]), list(range(size))),
     ]  # fmt: skip
 
 
