@@ -47,13 +47,8 @@ def dataset_info(_: Registries, *, json: bool = False) -> int:
     json : print JSON
     """
     found = dataset.info()
-    if json:
-        print(dumps(found))
-        return 0
-    for name, value in found.items():
-        items = value.items() if isinstance(value, dict) else ()
-        text = ", ".join(f"{key} {count}" for key, count in items) or value
-        print(f"{name:16} {text}")
+    lines = [f"{name:11} {count}" for name, count in found.items()]
+    print(dumps(found) if json else "\n".join(lines))
     return 0
 
 

@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -26,6 +25,7 @@ from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.files.store import read_arrays, write_arrays
+from mortarbench.progress import ignore
 from mortarbench.registries import one_thread
 
 CHECKSUMS, CERTIFICATES = "CHECKSUMS", "certificates"
@@ -34,17 +34,17 @@ TEST_SET = "contact_qpbenchmark.py"
 #: Files that are copied into each folder, with their sources; the set is complete
 #: without this package. qpbenchmark loads the class that is named as the file.
 COPIED = {
-    **{name: name for name in ("README.md", "LICENSE", "CITATION.cff", TEST_SET)},
-    **{name: name for name in ("selection.py", "candidates.toml")},
-    "contact_every.py": TEST_SET,
-}
+    name: name
+    for name in ("README.md", "LICENSE", "CITATION.cff", TEST_SET, "selection.py",
+                 "candidates.toml")
+} | {"contact_every.py": TEST_SET}  # fmt: skip
 
 
 def build(
     out: str | Path,
     *,
     everything: bool = False,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = ignore,
 ) -> Path:
     """Build the public set of problems and sequences in a folder, and return the path.
 
@@ -63,10 +63,8 @@ def build(
 
     """
     folder = checked.path("out", out)
-    is_other = (
-        not folder.is_dir() or any(folder.iterdir()) if folder.exists() else False
-    )
-    if is_other and not (folder / CATALOGUE).is_file():
+    is_new = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    if not is_new and not (folder / CATALOGUE).is_file():
         raise InputError(f"{folder} is not empty; expected a new or empty folder")
     rows = [r for r in catalogue() if everything or r["core"] == "yes" or r["sequence"]]
     differing = list[str]()
@@ -77,8 +75,7 @@ def build(
             path, proof = (folder / row["path"], folder / CERTIFICATES / row["path"])
             if _digest(path) == row["digest"] and proof.is_file():
                 continue
-            if progress:
-                progress(f"{i}/{len(rows)} {row['name']}")
+            progress(f"{i}/{len(rows)} {row['name']}")
             if write_problem(row, path) != row["digest"]:
                 differing.append(row["path"])
             proof.parent.mkdir(parents=True, exist_ok=True)
@@ -128,18 +125,16 @@ def check(folder: str | Path) -> tuple[str, ...]:
     return tuple(found)
 
 
-def info() -> dict[str, Any]:
-    """Return numbers of problems, sequences and classes of the published set."""
+def info() -> dict[str, int]:
+    """Return numbers of problems, sequences and kinds of the published set."""
     table = pd.DataFrame(catalogue())
     single = table[table.sequence == ""]
-    core, first = single[single.core == "yes"], table[table.step == "1"]
     return {
-        "core": len(core),
+        "core": int((single.core == "yes").sum()),
         "problems": len(single),
-        "families": core.family.value_counts(sort=False).to_dict(),
-        "sequences": first.family.value_counts(sort=False).to_dict(),
+        "sequences": int((table.step == "1").sum()),
         "steps": len(table) - len(single),
-        "kinds": single.kind.value_counts(sort=False).to_dict(),
+        **single.kind.value_counts(sort=False).to_dict(),
     }
 
 

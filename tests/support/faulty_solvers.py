@@ -143,16 +143,6 @@ class Wanders(Sound):
         return replace(s, x=s.x + 1e-9 * np.random.default_rng().standard_normal())
 
 
-class Scales(Sound):
-    """Solver that scales read-only data in place but returns correct answers."""
-
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        qp.q.flags.writeable = True
-        qp.q[:] *= 2
-        return s
-
-
 class TakesAnything(Sound):
     def __init__(self, **options):
         pass
