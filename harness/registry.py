@@ -375,28 +375,29 @@ def load_plugin(file: str | Path | PluginFile) -> Plugin:
     if not plugin_file.path.is_file():
         raise _no_file(plugin_file)
     with located(str(plugin_file.path)), _importing_from(plugin_file.path.parent):
-        module = _imported(plugin_file.path)
-        offered = {
-            name: getattr(module, name)
-            for name in ("SOLVERS", "PROBLEMS", "OPERATORS")
-            if hasattr(module, name)
-        }
-        if not {"SOLVERS", "PROBLEMS"} & offered.keys():
+        module, offered = _imported(plugin_file.path), []
+        if not (hasattr(module, "SOLVERS") or hasattr(module, "PROBLEMS")):
             raise InputError("defines neither SOLVERS nor PROBLEMS")
-        checks = {"SOLVERS": check_solver, "PROBLEMS": check_family}
-        for name, things in offered.items():
+        for name, check in (
+            ("SOLVERS", check_solver),
+            ("PROBLEMS", check_family),
+            ("OPERATORS", _check_callable),
+        ):
+            things = getattr(module, name, {})
             if not isinstance(things, Mapping):
                 raise InputError(f"{name} is of type {_type(things)}; expected dict")
             for key, thing in things.items():
                 with located(f"{name}[{key!r}]"):
                     if not isinstance(key, str):
                         raise InputError("the key is not a string; expected a name")
-                    checks.get(name, _check_callable)(thing)
+                    check(thing)
+            offered.append(dict(things))
     prefix = f"{plugin_file.label}:" if plugin_file.label else ""
+    solvers, problems, operators = offered
     return Plugin(
-        solvers={f"{prefix}{k}": v for k, v in offered.get("SOLVERS", {}).items()},
-        problems=dict(offered.get("PROBLEMS", {})),
-        operators=dict(offered.get("OPERATORS", {})),
+        solvers={f"{prefix}{name}": solver for name, solver in solvers.items()},
+        problems=problems,
+        operators=operators,
         origin=str(plugin_file.path),
     )
 

@@ -8,7 +8,7 @@ import re
 import shutil
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from mortarbench.harness.files.durable import (
     replace_file,
     report_full_disk,
 )
-from mortarbench.harness.files.reading import opened, read_json
+from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.processes.locks import file_lock
 from mortarbench.harness.suite.growth import refuse_changed
 from mortarbench.harness.suite.suite import Suite, as_toml, read_suite
@@ -35,8 +35,7 @@ _FILES = ("environment.json", "suite.toml")
 _RESULT_FILES = ("validation.json",)
 REMEDY = "choose another --out or use --fresh"
 MAX_FOLDER_DEPTH = 30  #: largest depth of nested folders; runs write three levels
-_LOCK = ".lock"
-_LOCK_CONTENT = b"held by runs of mortarbench\n"
+_LOCK = ".mortarbench.lock"
 _DIGEST = re.compile(r"[\w.-]{1,64}")
 _SCRATCH = ".scratch"
 #: beginnings of the names of the folders and files of a result folder
@@ -100,10 +99,8 @@ def refuse_foreign(folder: Path) -> None:
         return
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
         return
-    with suppress(InputError), opened(folder / _LOCK) as lock:
-        # a run that was killed immediately leaves only its lock
-        if lock.read(len(_LOCK_CONTENT) + 1) == _LOCK_CONTENT:
-            return
+    if (folder / _LOCK).is_file():  # left by a run that was killed immediately
+        return
     ours = (*_FOLDERS, *_FILES, *_RESULT_FILES)
     taken = [name for name in ours if os.path.lexists(folder / name)]
     if taken:
@@ -118,8 +115,8 @@ def refuse_foreign(folder: Path) -> None:
 def lock_folder(folder: Path) -> Iterator[None]:
     """Lock a result folder within the block; create the folder if necessary.
 
-    The content of the lock file identifies a result folder, even if the run is killed
-    before it has written any other file. Unfinished files that killed runs left in the
+    The lock file identifies a result folder, even if the run is killed before it has
+    written any other file. Unfinished files that killed runs left in the
     folder are deleted.
 
     Raises
@@ -128,15 +125,13 @@ def lock_folder(folder: Path) -> Iterator[None]:
         If another run has locked the folder, or the folder cannot be written.
 
     """
-    lock = folder / _LOCK
     with ExitStack() as stack:
         try:
             with report_full_disk(folder):
                 folder.mkdir(parents=True, exist_ok=True)
                 stack.enter_context(
-                    file_lock(lock, flags=os.O_RDWR | os.O_CREAT, waits=False)
+                    file_lock(folder / _LOCK, flags=os.O_CREAT, waits=False)
                 )
-                lock.write_bytes(_LOCK_CONTENT)
         except BlockingIOError:
             raise InputError(
                 f"{folder} is being written by another run; wait, or choose another "

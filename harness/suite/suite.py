@@ -16,7 +16,7 @@ from msgspec import Meta, Struct
 from mortarbench.harness.checked import located
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, shown, unknown
-from mortarbench.harness.files.reading import read_toml
+from mortarbench.harness.files.reading import read_toml, toml
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.registry import SolverSpec, in_words, resolve
 from mortarbench.harness.suite.parameter_grid import (
@@ -173,6 +173,9 @@ def read_suite(path: Path) -> SuiteFile:
 def as_toml(table: Mapping[str, Any]) -> str:
     """Return a suite as TOML, with one line per key.
 
+    Strings, numbers and lists are the same in JSON, and inline tables have another
+    separator.
+
     Raises
     ------
     InputError
@@ -183,42 +186,31 @@ def as_toml(table: Mapping[str, Any]) -> str:
     tolerances = [1e-06]
 
     """
-    return "".join(f"{_key(k)} = {_value(str(k), v)}\n" for k, v in table.items())
-
-
-def _key(key: object) -> str:
-    if not isinstance(key, str):
-        raise InputError(f"key {shown(key)}; expected a string")
-    return json.dumps(key) if re.search(r"[^\w-]|^$", key, re.ASCII) else key
-
-
-def _value(where: str, value: Any) -> str:
-    """Return a value as TOML on one line; NumPy arrays and ranges become lists.
-
-    where : path of the value, for messages
-    """
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    match value:
-        # JSON strings are valid TOML strings except in two cases, which are avoided
-        # here: JSON does not escape DEL, and its ASCII form splits characters beyond 16
-        # bits into surrogate pairs.
-        case str() | Path():
-            return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
-        case bool() | int() | float():
-            return repr(value).lower()
-        case Mapping():
-            pairs = (
-                f"{_key(k)} = {_value(f'{where}.{k}', v)}" for k, v in value.items()
+    lines = []
+    for key, value in table.items():
+        try:
+            text = json.dumps(
+                value, ensure_ascii=False, separators=(", ", " = "), default=_plain
             )
-            return f"{{ {', '.join(pairs)} }}"
-        case list() | tuple() | range():
-            entries = (_value(f"{where}[{i}]", v) for i, v in enumerate(value))
-            return f"[{', '.join(entries)}]"
-    raise InputError(
-        f"{where} = {shown(value)}; expected a string, a number, true or false, a "
-        "list or a dict; leave out keys without a value"
-    )
+            lines.append(f"{key} = {text}\n")
+            toml(lines[-1])
+        # an AttributeError is raised for other objects
+        except (InputError, TypeError, ValueError, AttributeError, RecursionError):
+            raise InputError(
+                f"{shown(key)[1:-1]} = {shown(value)}; expected a string, a number, "
+                "true or false, a list or a dict; leave out keys without a value"
+            ) from None
+    return "".join(lines)
+
+
+def _plain(value: Any) -> Any:
+    """Return arrays and scalars of NumPy, ranges and paths as plain data for JSON."""
+    match value:
+        case range():
+            return [*value]
+        case Path():
+            return str(value)
+    return value.tolist()
 
 
 def _solvers(file: SuiteFile, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:

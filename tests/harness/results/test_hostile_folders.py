@@ -129,7 +129,8 @@ def test_commands_read_nothing_outside_the_folder_for_malformed_digests(
 
 LINKS = (
     "journal", "vectors", "environments", "report", ".scratch",
-    "environment.json", "suite.toml", "validation.json", "validation.tmp", ".lock",
+    "environment.json", "suite.toml", "validation.json", "validation.tmp",
+    ".mortarbench.lock",
     "report/index.html", "report/report.md", "report/figures",
     "report/tables/evil", "vectors/evil.npz",
 )  # fmt: skip

@@ -371,7 +371,7 @@ def once_each(folder, count):
     return records
 
 
-@pytest.mark.parametrize("lost", [".scratch", ".lock", "vectors"])
+@pytest.mark.parametrize("lost", [".scratch", ".mortarbench.lock", "vectors"])
 def test_files_deleted_during_a_run_lose_no_measurement(measure, tmp_path, lost):
     def delete():
         path = tmp_path / lost
