@@ -24,7 +24,6 @@ from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.running.progress import Progress
 
 _REASON_LENGTH = 120  #: maximum displayed length of the reason for declining a QP
-_BAR_WIDTH = 60  #: smallest width of a terminal, in columns, at which a bar is shown
 WAIT_SECONDS = 10.0  #: time between two lines of `waiting`
 _UPDATE_SECONDS = 0.2  #: shortest time between two updates of a bar in a notebook
 
@@ -162,19 +161,14 @@ def display_on(stream: TextIO) -> Iterator[Progress]:
     from rich.progress import Progress as Bars
     from rich.table import Column
 
-    def column(**settings: Any) -> Column:
-        return Column(no_wrap=True, **settings)
-
+    text = Column(no_wrap=True, overflow="ellipsis", ratio=1)
     columns: list[ProgressColumn] = [
-        MofNCompleteColumn(table_column=column()),
-        TextColumn("{task.fields[left]}", table_column=column()),
-        TextColumn(
-            "{task.description}", table_column=column(overflow="ellipsis", ratio=1)
-        ),
+        BarColumn(bar_width=20),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[left]}"),
+        TextColumn("{task.description}", table_column=text),
     ]
     console = Console(file=stream)
-    if console.width >= _BAR_WIDTH:
-        columns.insert(0, BarColumn(bar_width=20))
     with Bars(*columns, console=console, expand=True) as bar:
         task = bar.add_task("starting", total=None, left="")
 

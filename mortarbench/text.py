@@ -141,7 +141,9 @@ def outcome(r: Record, options: Iterable[str]) -> str:
     """
     chosen = ", ".join(f"{key}={r.options[key]}" for key in options)
     per = "" if in_space(r.quantities) else "/m"
-    units = _units(per) if "dofs" in r.quantities else {}
+    units = {}
+    if "dofs" in r.quantities:
+        units = {name: unit.replace("/m", per) for name, unit in UNITS.items()}
     several = r.inner > 1
     timed = f"s (mean of {r.inner} runs)" if several else "s (one run)"
     rows = [
@@ -158,11 +160,11 @@ def outcome(r: Record, options: Iterable[str]) -> str:
         ("solve", _text(r.solve_seconds, timed, digits=3)),
         ("peak memory", _text(r.peak_mib, "MiB", digits=4)),
         *(
-            (f"{name} residual", _text(_none_if_nan(getattr(r, name)), digits=2))
+            (f"{name} residual", _text(getattr(r, name), digits=2))
             for name in ("primal", "dual", "complementarity", "gap")
         ),
         ("solver error", _bound(r)),
-        ("objective", _text(_none_if_nan(r.objective))),
+        ("objective", _text(r.objective)),
         *(
             (name.replace("_", " "), _text(value, units.get(name, "")))
             for name, value in r.quantities.items()
@@ -171,14 +173,6 @@ def outcome(r: Record, options: Iterable[str]) -> str:
         *_contacts(r.quantities.get(_CONTACTS), f"N{per}"),
     ]
     return align([(name, value) for name, value in rows if value])
-
-
-def _units(per: str) -> Mapping[str, str]:
-    """Return the units of quantities by name.
-
-    per : "/m" for plane bodies, whose forces are per metre of thickness; "" in 3D
-    """
-    return {name: unit.replace("/m", per) for name, unit in UNITS.items()}
 
 
 def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
@@ -284,15 +278,12 @@ def align(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _none_if_nan(value: float | None) -> float | None:
-    """Return None if a number is NaN, which represents a missing value."""
-    return None if value is None or math.isnan(value) else value
-
-
 def _text(value: Any, unit: str = "", digits: int = 9) -> str:
-    """Return a number or nested numbers as text with a unit; return "" for None."""
+    """Return a number or nested numbers as text with a unit; "" for None and NaN."""
     match value:
         case None:
+            return ""
+        case float() if math.isnan(value):
             return ""
         case float():
             text = f"{value:.{digits}g}"

@@ -195,17 +195,16 @@ def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
         return
     grid, u = mechanics.grid, case.family_case.recover(solution)
     lengths = np.linalg.norm(u.reshape(grid.points.shape), axis=1)
-    worst, text = 1.0, ""
+    sizes = []  # motion relative to the size, size in m, and number of each body
     for body in np.unique(grid.bodies):
         nodes = np.unique(grid.cells[grid.bodies == body])
         size = float(np.ptp(grid.points[nodes], axis=0).max())
-        if lengths[nodes].max() > worst * size:
-            worst = float(lengths[nodes].max()) / size
-            name = repr(mechanics.names[body]) if mechanics.names else str(body)
-            text = (
-                f"body {name} moves by up to {lengths[nodes].max():.3g} m, which "
-                f"exceeds its size of {size:.3g} m; linear kinematics is valid only "
-                "for small displacements: check the moduli, the loads and the supports"
-            )
-    if text:
-        yield text
+        sizes.append((float(lengths[nodes].max()) / size, size, body))
+    ratio, size, body = max(sizes)
+    if ratio > 1:
+        name = repr(mechanics.names[body]) if mechanics.names else str(body)
+        yield (
+            f"body {name} moves by up to {ratio * size:.3g} m, which exceeds its size "
+            f"of {size:.3g} m; linear kinematics is valid only for small "
+            "displacements: check the moduli, the loads and the supports"
+        )

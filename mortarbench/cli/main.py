@@ -16,7 +16,6 @@ import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from pathlib import Path
 from typing import NoReturn
 
 import mortarbench
@@ -72,7 +71,7 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
         from mortarbench.harness.files.durable import FULL
 
         if e.filename is not None:
-            return _print_error(_file_error(e, Path(os.fsdecode(e.filename))))
+            return _print_error(f"{os.fsdecode(e.filename)}: {e.strerror}")
         if e.errno in FULL:
             return _print_error(f"a file could not be written: {e.strerror}")
         traceback.print_exc()
@@ -116,14 +115,6 @@ def _ended(how: str, argv: Sequence[str]) -> str:
     """Return the message for an interrupted or terminated command."""
     continues = argv[:1] in (["run"], ["dataset"])
     return f"{how}; the same command continues" if continues else how
-
-
-def _file_error(e: OSError, path: Path) -> str:
-    """Return the one-line message for an operating-system error concerning a file."""
-    if isinstance(e, FileExistsError | NotADirectoryError):
-        path = next((p for p in (path, *path.parents) if p.is_file()), path)
-        return f"{path}: a file exists where a folder is needed; move the file away"
-    return f"{path}: {e.strerror}"
 
 
 def _print_error(message: str) -> int:

@@ -47,15 +47,11 @@ class Parser(argparse.ArgumentParser):
         if self._subparsers is None:  # a command
             options = [name for name in self._option_string_actions if len(name) > 2]
             for text in takewhile(lambda text: text != "--", args or ()):
-                name, _, value = text.partition("=")
+                name = text.partition("=")[0]
                 if name.startswith("--") and name not in options:
                     near = get_close_matches(name, options, n=1)
                     hint = f"; did you mean {near[0]}?" if near else ""
                     self.error(f"unknown argument {name!r}{hint}")
-                if name.startswith("--") and value == "--":  # argparse would ignore it
-                    raise InputError(
-                        f"{text}: -- is not a value; expected {name}=VALUE"
-                    )
         return super().parse_known_args(args, namespace)
 
     def _check_value(self, action: argparse.Action, value: object) -> None:

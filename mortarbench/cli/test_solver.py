@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import fnmatch
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from json import dumps
 from typing import Annotated, Any
 
@@ -26,17 +25,16 @@ def test_solver(
 
     Exit code 1: a check fails, or a solver solves no QP.
 
-    solvers : a solver, or a pattern such as 'p*'
+    solvers : names of solvers
     markdown : print only the failed checks and the weaknesses, as a Markdown list
     json : print JSON
     """
     if markdown and json:
         raise InputError("--json: not allowed with --markdown; expected one of them")
-    names = [n for pattern in solvers for n in _named(pattern, registries.solvers)]
-    for name in names:
+    for name in solvers:
         check_name(name, registries.solvers)
     results = []
-    for name in names:
+    for name in solvers:
         with waiting() as progress:
             result = mb.test_solver(
                 name,
@@ -53,11 +51,3 @@ def test_solver(
         if one.objection:
             say(f"{one.solver} does not conform: it {one.objection}")
     return 0 if all(one.conforms for one in results) else 1
-
-
-def _named(pattern: str, solvers: Collection[str]) -> list[str]:
-    """Return the solvers that match a pattern; if none matches, return the pattern."""
-    if "*" not in pattern or pattern in solvers:
-        return [pattern]
-    matches = [s for s in fnmatch.filter(solvers, pattern) if not s.endswith(":*")]
-    return matches or [pattern]
