@@ -1,5 +1,7 @@
 """Solids from gmsh files, compared with exact solutions and decomposed bodies."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from mortarbench.harness import InputError
 from mortarbench.problems.families.description import read_bodies
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support import ROOT
 from tests.support.cases import built
 from tests.support.hexahedra import TETRAHEDRA, WEDGES
 from tests.support.refusals import refused
@@ -134,6 +137,15 @@ def test_settings_unsupported_for_volumes_are_refused_in_one_line(
     toml = TOML.replace(old, new) if old else TOML
     with refused(message):
         built(f"bodies:{solid_blocks(tmp_path, TETRAHEDRA, toml)}{keys}/dual")
+
+
+def test_a_uniform_pull_on_an_irregular_mesh_is_named_by_its_direction(tmp_path):
+    text = (ROOT / "tests/data/blocks.toml").read_text()
+    shutil.copy(ROOT / "tests/data/blocks.msh", tmp_path)
+    path = tmp_path / "blocks.toml"
+    path.write_text(text.replace("[0, 0, -1e6]", "[0, 0, 1e6]"))
+    with refused("body 'upper': nothing balances its load in z;"):
+        built(f"bodies:{path}/dual")
 
 
 def test_a_block_that_tips_over_an_edge_is_refused(tmp_path):
