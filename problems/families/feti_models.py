@@ -89,15 +89,12 @@ from mortarbench.problems.keys import (
     CONTACT_FORMS,
     MAX_SIZE,
     MIN_SIZE,
-    PLANE_ONLY,
     POSITIVE,
     Dimension,
     Feti,
     Glue,
-    PlaneState,
     check_decomposition,
     check_memory,
-    refuse_unbuilt,
     refuse_unused,
 )
 
@@ -660,20 +657,17 @@ PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
 class Plate(DecomposedFamily):
     """A clamped plate or box of subdomains with jumps of E, for studies of FETI.
 
-    A plate of `width` × `height` is clamped at its left edge and pulled down by 1 MN
-    per m of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In
-    some subdomains, the modulus is multiplied by `jump`: in every other subdomain
-    (``checkerboard``) or in the subdomains at the clamped edge (``column``). There is
-    no contact; therefore, the dual has equality constraints only. Condition numbers of
-    the dual measure the scalability of the method independently of load, stopping
-    criterion and units.
-
-    The load acts at the upper right corner (``point``), as a constant traction on the
-    right edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
+    A plate of `width` × `height` in plane strain is clamped at its left edge, and a
+    constant traction on its right edge pulls it down by 1 MN per m of thickness. It
+    consists of Sx × Sy subdomains of n × ny cells of steel. In some subdomains, the
+    modulus is multiplied by `jump`: in every other subdomain (``checkerboard``) or
+    in the subdomains at the clamped edge (``column``). There is no contact;
+    therefore, the dual has equality constraints only. Condition numbers of the dual
+    measure the scalability of the method independently of load, stopping criterion
+    and units.
 
     In 3D (dim=3) the plate is a box of Sx × Sy × Sz subdomains with n cells along z. It
-    is clamped at x = 0 and pulled along −z by 1 MN on the face at the largest x, or at
-    its corner of largest y and z (``point``).
+    is clamped at x = 0 and pulled along −z by 1 MN on the face at the largest x.
     """
 
     forms: ClassVar = ("primal", "dual")
@@ -689,8 +683,6 @@ class Plate(DecomposedFamily):
         "subdomains whose modulus is multiplied by `jump`",
     ] = "uniform"
     jump: Annotated[float, POSITIVE, "ratio of the two moduli"] = 1.0
-    load: Annotated[Literal["point", "edge", "nodal"], "place of the load"] = "edge"
-    plane: PlaneState = "strain"
     glue: Glue = "orthonormal"
     dim: Dimension = 2
     Sz: Annotated[int, Range(1), "subdomains along z in 3D"] = 1
@@ -711,8 +703,6 @@ class Plate(DecomposedFamily):
             )
         if self.dim == 2:
             refuse_unused(self, "Sz", "dim=2", "dim=3")
-        else:
-            refuse_unbuilt(self, PLANE_ONLY, "dim=3", "a plane problem")
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -738,7 +728,7 @@ class Plate(DecomposedFamily):
     @property
     def state(self) -> Plane | None:
         """Plane state; None in 3D."""
-        return self.plane if self.dim == 2 else None
+        return "strain" if self.dim == 2 else None
 
     @property
     def moduli(self) -> Vector:
@@ -868,7 +858,7 @@ class Plate(DecomposedFamily):
             glue=self.glue,
             material=_pattern(self),
             assemble_class=partial(elastic_class, D=self.D, E=self.moduli),
-            load=_pull(mesh, self.load),
+            load=_pull(mesh),
             fixed=self.clamped,
             contact=Contact(no_rows(self.dim * layout.nodes), none, none),
         )
@@ -886,13 +876,9 @@ def _pattern(plate: Plate) -> NDArray[np.int64]:
     return patterns[plate.pattern]
 
 
-def _pull(mesh: Mesh, kind: str) -> Vector:
-    """Return the load (n,), distributed over the right side by the key `load`."""
+def _pull(mesh: Mesh) -> Vector:
+    """Return the load (n,), a constant traction on the right side."""
     nodes, share = nodal_sizes(mesh.points, mesh.boundaries["right"])
-    if kind == "point":
-        share = (nodes == nodes.max()).astype(float)
-    elif kind == "nodal":
-        share = np.ones(nodes.size)
     f = np.zeros(mesh.dofs)
     f[dofs_of(nodes, mesh.dim, mesh.dim - 1)] = -share / share.sum()
     return f

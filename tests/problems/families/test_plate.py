@@ -18,10 +18,10 @@ from tests.support.cases import built
 
 pytestmark = pytest.mark.together
 
-#: test of MSolve (Papagiannakis 2011); E of the left column is 1/1000 of E elsewhere
+#: bodies of a test of MSolve (Papagiannakis 2011); E of the left column is 1/1000 of E
+#: elsewhere
 CANTILEVER = (
-    "plate/Sy=2/n=5/ny=10/width=3.0/height=1.5/pattern=column/jump=0.001/load=nodal/"
-    "plane=stress/glue=redundant"
+    "plate/Sy=2/n=5/ny=10/width=3.0/height=1.5/pattern=column/jump=0.001/glue=redundant"
 )
 CUBES = {"dim": 3, "Sx": 2, "Sy": 2, "Sz": 2}
 #: keys; number of multipliers; κ(PFP), ‖PFP‖, κ lumped, κ Dirichlet
@@ -83,11 +83,11 @@ def test_condition_numbers_with_jumps_are_those_of_a_prototype(jump, name, value
     [
         *(f"plate/pattern=checkerboard/jump=100.0/glue={glue}"
           for glue in ("orthonormal", "redundant")),
-        "plate/Sx=3/Sy=2/n=3/load=point",
+        "plate/Sx=3/Sy=2/n=3",
         CANTILEVER,
         *(f"plate/Sx=2/Sy=3/n=2/ny=1/pattern=checkerboard/jump=100.0/glue={glue}/dim=3"
           "/Sz=2" for glue in ("orthonormal", "redundant")),
-        "plate/Sx=2/Sy=2/n=2/load=point/dim=3/Sz=2",
+        "plate/Sx=2/Sy=2/n=2/dim=3/Sz=2",
     ],
 )  # fmt: skip
 def test_the_dual_has_the_displacement_of_the_plate(name):
@@ -105,10 +105,9 @@ def test_the_dual_has_the_displacement_of_the_plate(name):
     )
 
 
-@pytest.mark.parametrize("load", ["point", "edge", "nodal"])
 @pytest.mark.parametrize("keys", [{}, {**CUBES, "n": 2}])
-def test_every_load_pulls_with_one_meganewton(load, keys):
-    plate = Plate(load=load, **keys)
+def test_the_load_pulls_with_one_meganewton(keys):
+    plate = Plate(**keys)
     f = -plate.qp.q.reshape(-1, plate.dim)
     assert f[:, -1].sum() == pytest.approx(-1.0)
     assert not f[:, :-1].any()

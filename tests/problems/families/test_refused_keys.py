@@ -143,7 +143,6 @@ REFUSED = {
         ("jump=2", "jump=2.0 is not used by pattern=uniform"),
         ("pattern=stripes", "'uniform' or 'checkerboard' or 'column'"),
         ("Sz=2", "Sz=2 is not used by dim=2"),
-        ("dim=3/plane=stress", "plane=stress with dim=3 is not built"),
     ],
     "bodies:press.toml": [
         ("parts=-1", "parts=-1 must be at least 0"),
