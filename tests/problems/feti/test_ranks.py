@@ -245,8 +245,7 @@ def generated(rng):
     )
     yield (
         f"plate/Sx={n[0] % 3 + 1}/Sy={n[1] % 2 + 3}/n={n[2] % 4 + 1}/ny={n[3] % 4}/"
-        f"pattern={rng.choice(['checkerboard', 'column'])}/jump=100/"
-        f"load={rng.choice(['point', 'edge', 'nodal'])}/{glue}"
+        f"pattern={rng.choice(['checkerboard', 'column'])}/jump=100/{glue}"
     )
     yield f"membranes/S={n[4] % 3 + 2}/n={n[5] % 4 + 1}/{glue}"
     yield (
