@@ -315,15 +315,15 @@ def largest_stresses(torn: TornBodies, elastic: UnassembledBodies, u: Vector) ->
     for b, material in enumerate(materials):
         of_body = layout.body_of_cell == b
         cells, owner = layout.mesh.cells[of_body], rank[of_body]
-        corners = np.ascontiguousarray(cells.T)
         for own, of_rank in enumerate(patches):
-            is_inside = np.zeros(len(points), dtype=bool)
-            is_inside[cells[owner == own]] = True
+            inner, outer = cells[owner == own], cells[owner != own]
+            is_inside, corners = np.zeros(len(points), dtype=bool), outer.T.copy()
+            is_inside[inner] = True
             near = is_inside.copy()
             for _ in range(STRESS_LAYERS):
-                selected = cells[near[corners].any(axis=0)]
-                near[selected] = True
-            local = (np.cumsum(near) - 1)[selected]
+                around = outer[near[corners].any(axis=0)]
+                near[around] = True
+            local = (np.cumsum(near) - 1)[np.concatenate([inner, around])]
             mesh = points[near], local, u[near], is_inside[near]
             of_rank.append(Patch(*mesh, D[b], material.nu, plane))
     largest = torn.team.place(largest_in_patches, patches)
