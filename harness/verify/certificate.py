@@ -75,11 +75,7 @@ from mortarbench.harness.mechanics import (
 )
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.solution import Solution
-from mortarbench.harness.verify.active_set_refinement import (
-    exchanged,
-    suggested,
-    unconstrained_guess,
-)
+from mortarbench.harness.verify.active_set import suggested
 from mortarbench.harness.verify.admissible import (
     UncertifiableError,
     admissible,
@@ -115,11 +111,6 @@ SHARP_WORK = 0.05
 #: wrong if its error is large. Without this limit, a bound of 0.64 became 1.8.
 MAX_SHARP_BOUND = 1e-2
 SHARP_BOUND = 1e-7  #: largest relative bound for which no further pair is tried
-#: Largest bound for which the closed rows are taken from the answer. If the error is
-#: larger, the solution for these rows may be far from the answer.
-MAX_EXCHANGE_BOUND = 1e-3
-#: Largest number of exchanges of closed rows in search of a better pair.
-EXCHANGE_ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -293,16 +284,13 @@ def certify_pair(
 ) -> Certificate:
     """Bound the error of a displacement; multipliers suggest admissible forces.
 
-    Up to four pairs (û, λ̂) are tried, and the certificate with the smallest `error` is
+    Up to three pairs (û, λ̂) are tried, and the certificate with the smallest `error` is
     returned:
 
     1. a pair with the active rows that the answer suggests;
     2. if the first pair yields no sharp certificate: the pair of the answer, changed as
        little as admissibility requires;
-    3. if only contact supports an undivided body, and the first two pairs prove a bound
-       of at most `MAX_EXCHANGE_BOUND` but no sharp one: the solution for the closed
-       rows that the answer suggests, after at most `EXCHANGE_ROUNDS` exchanges of rows;
-    4. if no other pair proves a bound: the pair near zero, which does not depend on the
+    3. if no other pair proves a bound: the pair near zero, which does not depend on the
        answer.
 
     claimed : (n,) displacement of the answer
@@ -321,11 +309,7 @@ def certify_pair(
     certificates = [c for c in outcomes if isinstance(c, Certificate)]
     if not certificates:
         raise UncertifiableError(f"no admissible pair near the answer: {outcomes[0]}")
-    best = min(certificates, key=lambda c: c.error)
-    whole = split.undivided
-    if whole is None or whole.lift.any() or best.bound <= 1:
-        return best
-    return replace(best, least=max(best.least, _least_norm(whole)))
+    return min(certificates, key=lambda c: c.error)
 
 
 def _certificates(
@@ -344,13 +328,6 @@ def _certificates(
             bounds.append(outcome.bound)
     if not bounds:
         yield _proved(split, claimed, 0 * split.exact.f, 0 * lam, none)
-    elif (
-        split.undivided is not None
-        and split.motions.all.shape[1]
-        and SHARP_BOUND < min(bounds) <= MAX_EXCHANGE_BOUND
-    ):
-        v, mu, active = exchanged(split.undivided, active, EXCHANGE_ROUNDS)
-        yield _proved(split, claimed, v, mu, active.closed)
 
 
 def _proved(split: Split, *pair: Any) -> Certificate | str:
@@ -359,16 +336,6 @@ def _proved(split: Split, *pair: Any) -> Certificate | str:
         return proof(split, *pair)
     except UncertifiableError as e:
         return str(e)
-
-
-def _least_norm(mechanics: Mechanics) -> float:
-    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer.
-
-    The bound is 0 if the pair is not admissible.
-    """
-    u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
-    found = _proved(Split(mechanics), u, u, lam, active.closed)
-    return found.least if isinstance(found, Certificate) else 0.0
 
 
 def is_sharp(outcome: Certificate | str) -> bool:

@@ -23,14 +23,14 @@ from scipy.sparse import csr_array
 from mortarbench.harness import Case, Mechanics, Solution, Status
 from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.sets.convex import hull
-from mortarbench.harness.verify.active_set_refinement import (
+from mortarbench.harness.verify.active_set import (
     CLOSED,
     LOWER,
     UPPER,
     States,
-    exchanged,
     suggested,
 )
+from mortarbench.harness.verify.admissible import closing
 from mortarbench.harness.verify.certificate import Certificate, proof
 from mortarbench.harness.verify.substructured import Split
 from mortarbench.solvers.reference.solve import reference_solution
@@ -156,7 +156,21 @@ def refined_point(case: Case) -> tuple[Certificate, States]:
     exact, s = mechanics.exact, mechanics.to_primal(reference_solution(case.qp))
     lam = mechanics.multipliers(s).astype(Real)
     active = suggested(exact, s.x.astype(Real), lam)
-    u, lam, active = exchanged(mechanics, active)
+    lam = exact.forces.project(active.at_bounds(lam))
+    R, close = mechanics.motions.constrained, closing(mechanics, active.closed)
+    elastic, alpha = 0 * exact.f, np.zeros(R.shape[1], dtype=Real)
+    for _ in range(10):
+        pull = exact.f - exact.B.T @ lam
+        for _ in range(3):
+            r = pull - mechanics.motions.KR @ alpha - mechanics.stiffness @ elastic
+            r[exact.fixed] = 0
+            elastic = elastic + mechanics.apply_inverse(mechanics.motions.without(r))
+        u = elastic + R @ alpha
+        force = R.T @ pull - mechanics.motions.KR.T @ u
+        excess = (exact.B @ u - exact.c)[active.closed]
+        mu, further = close(excess.astype(np.float64), force.astype(np.float64))
+        lam[active.closed] += mu
+        alpha = alpha + further
     return proof(Split(mechanics), u, u, lam, active.closed), active.states
 
 
