@@ -69,13 +69,14 @@ from numpy.typing import NDArray
 
 from mortarbench.harness.mechanics import (
     DecomposedMechanics,
+    Exact,
     Extended,
     Mechanics,
     Real,
 )
 from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.sets.blocks import norms
 from mortarbench.harness.solution import Solution
-from mortarbench.harness.verify.active_set import suggested
 from mortarbench.harness.verify.admissible import (
     UncertifiableError,
     admissible,
@@ -317,17 +318,40 @@ def _certificates(
 ) -> Iterator[Certificate | str]:
     """Yield certificates of pairs, or reasons for their absence, until one is sharp."""
     exact, u = split.exact, split.free(claimed.astype(Real))
-    lam, bounds = exact.forces.project(multipliers.astype(Real)), list[float]()
-    active, none = suggested(exact, u, lam), np.zeros(lam.size, dtype=bool)
-    for forces, closed in (active.at_bounds(lam), active.closed), (lam, none):
+    lam = exact.forces.project(multipliers.astype(Real))
+    none, is_proven = np.zeros(lam.size, dtype=bool), False
+    for forces, closed in suggested(exact, u, lam), (lam, none):
         outcome = _proved(split, claimed, u, forces, closed)
         yield outcome
         if is_sharp(outcome):
             return
-        if isinstance(outcome, Certificate):
-            bounds.append(outcome.bound)
-    if not bounds:
+        is_proven |= isinstance(outcome, Certificate)
+    if not is_proven:
         yield _proved(split, claimed, 0 * split.exact.f, 0 * lam, none)
+
+
+def suggested(
+    exact: Exact, u: Extended, multipliers: Extended
+) -> tuple[Extended, NDArray[np.bool_]]:
+    """Return multipliers (m,) near λ, and the mask (m,) of rows that should be closed.
+
+    A closed row holds with equality: a contact that touches, or friction that sticks.
+    As in a primal-dual active set method, rows with λ + v/D inside the set Λ of
+    admissible multipliers are closed, where v = Bu − c and D is the compliance of the
+    row. The multipliers of all other rows are projections of λ + v/D onto Λ.
+    """
+    discs, softness, v = exact.forces.discs, exact.compliance, exact.motion(u)
+    closed = multipliers * softness > -v
+    soft = softness[discs.index].mean(axis=1, keepdims=True)
+    push = multipliers[discs.index] * soft + v[discs.index]
+    size, radius = norms(push)[:, None], discs.radius[:, None]
+    closed[discs.index] = size < radius * soft
+    nearest = np.where(closed, multipliers, 0)
+    # if λD + v is zero, λ itself is the limit
+    slips = ~closed[discs.index] & (size > 0)
+    limits = push / np.where(size > 0, size, 1) * radius
+    nearest[discs.index] = np.where(slips, limits, multipliers[discs.index])
+    return nearest, closed
 
 
 def _proved(split: Split, *pair: Any) -> Certificate | str:

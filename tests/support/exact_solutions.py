@@ -23,21 +23,17 @@ from scipy.sparse import csr_array
 from mortarbench.harness import Case, Mechanics, Solution, Status
 from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.sets.convex import hull
-from mortarbench.harness.verify.active_set import (
-    CLOSED,
-    LOWER,
-    UPPER,
-    States,
-    suggested,
-)
 from mortarbench.harness.verify.admissible import closing
-from mortarbench.harness.verify.certificate import Certificate, proof
+from mortarbench.harness.verify.certificate import Certificate, proof, suggested
 from mortarbench.harness.verify.substructured import Split
 from mortarbench.solvers.reference.solve import reference_solution
 
 BITS = 500  #: number of bits after the binary point
 FINE = 330  #: number of correct bits after refinement, relative to the largest unknown
+#: States of a row: multiplier at its lower bound, row closed, or at its upper bound
+LOWER, CLOSED, UPPER = -1, 0, 1
 Integers = NDArray[np.object_]
+States = NDArray[np.int64]  # (m,) state of each row
 
 
 def integers(v: Any) -> Integers:
@@ -155,9 +151,9 @@ def refined_point(case: Case) -> tuple[Certificate, States]:
     mechanics = case.mechanics.whole
     exact, s = mechanics.exact, mechanics.to_primal(reference_solution(case.qp))
     lam = mechanics.multipliers(s).astype(Real)
-    active = suggested(exact, s.x.astype(Real), lam)
-    lam = exact.forces.project(active.at_bounds(lam))
-    R, close = mechanics.motions.constrained, closing(mechanics, active.closed)
+    lam, closed = suggested(exact, s.x.astype(Real), exact.forces.project(lam))
+    states = np.where(closed, CLOSED, np.where(lam > 0, UPPER, LOWER))
+    R, close = mechanics.motions.constrained, closing(mechanics, closed)
     elastic, alpha = 0 * exact.f, np.zeros(R.shape[1], dtype=Real)
     for _ in range(10):
         pull = exact.f - exact.B.T @ lam
@@ -167,11 +163,11 @@ def refined_point(case: Case) -> tuple[Certificate, States]:
             elastic = elastic + mechanics.apply_inverse(mechanics.motions.without(r))
         u = elastic + R @ alpha
         force = R.T @ pull - mechanics.motions.KR.T @ u
-        excess = (exact.B @ u - exact.c)[active.closed]
+        excess = (exact.B @ u - exact.c)[closed]
         mu, further = close(excess.astype(np.float64), force.astype(np.float64))
-        lam[active.closed] += mu
+        lam[closed] += mu
         alpha = alpha + further
-    return proof(Split(mechanics), u, u, lam, active.closed), active.states
+    return proof(Split(mechanics), u, u, lam, closed), states
 
 
 def exact_solution(case: Case) -> ExactSolution:
