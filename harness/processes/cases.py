@@ -6,10 +6,9 @@ The requests and their answers are:
   Answer: ``{"meta": {…}}``, the fields ``qp``, ``build_seconds`` and
   ``dualise_seconds`` of the record
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates the
-  point in the file ``point``. Answer: ``{"quantities": {…}, "bounds": {…}, "notes":
-  […], "seconds": …}``, with the physical quantities of the point, the bounds on its
-  error, and the time in which the quantities were computed. If ``fields`` is a path and
-  the case defines a deformed state, this state is written to ``fields``
+  point in the file ``point``. Answer: ``{"fields": {…}, "notes": […]}``, with the
+  entries of the record that `harness.verify.verdicts.results_of` returns. If ``fields``
+  is a path and the case defines a deformed state, this state is written to ``fields``
 
 If a case cannot be built, the answer is ``{"unbuilt": REASON, "past_end": …}``;
 ``past_end`` is true if the case lies beyond the last problem of a sequence
@@ -39,8 +38,8 @@ from mortarbench.harness.files.store import (
 from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.record import finite
-from mortarbench.harness.solution import Solution, Status
-from mortarbench.harness.verify.verdicts import certified, note_of, quantities_of
+from mortarbench.harness.solution import Status
+from mortarbench.harness.verify.verdicts import note_of, results_of
 
 #: The first dual case of a process is built again if its build took less than this
 #: time, in s. Effects of first calls (page faults, caches, late imports) took 12 of the
@@ -61,8 +60,9 @@ class Cases:
     _cases: dict[str, Case] = field(default_factory=dict)
     _build_seconds: float = 0.0  # duration of the last build, s
     _warm: bool = False  # True once a dual case has been built
-    #: error bounds and note (see `certified`) by case name and digest of the point
-    _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
+    #: results and notes (see `results_of`) by case name and digest of the point, since
+    #: most solvers return identical points in all repeats
+    _results: dict[tuple[str, str], tuple[dict[str, Any], list[str]]] = field(
         default_factory=dict
     )
 
@@ -88,11 +88,11 @@ class Cases:
         self, case: Case, name: CaseId, request: dict[str, Any]
     ) -> dict[str, Any]:
         s = read_point(Path(request["point"]), Status.SOLVED)
-        start = perf_counter()
-        quantities, note = quantities_of(case, s)
-        seconds = perf_counter() - start
-        bounds, objection = self._certify(case, name, s)
-        notes = [text for text in (note, objection) if text]
+        key = name.name, digest_of(point_arrays(s))
+        if key not in self._results:
+            self._results[key] = results_of(case, s)
+        results, texts = self._results[key]
+        notes = [*filter(None, texts)]
         if request["fields"] is not None and case.fields is not None:
             try:
                 fields = field_arrays(case.fields(s))
@@ -100,29 +100,7 @@ class Cases:
                 notes.append(note_of("fields", e))
             else:
                 write_arrays(Path(request["fields"]), fields)
-        return {
-            "quantities": quantities,
-            "bounds": finite(bounds),
-            "notes": notes,
-            "seconds": seconds,
-        }
-
-    def _certify(
-        self, case: Case, name: CaseId, s: Solution
-    ) -> tuple[dict[str, Any], str]:
-        """Bound the error of a point, or look up the bounds of an identical point.
-
-        Most solvers return identical points in all repeats. In this case, only the
-        answer of the first repeat is certified, and only its record has
-        `certify_seconds`.
-        """
-        key = name.name, digest_of(point_arrays(s))
-        if key in self._bounds:
-            bounds, objection = self._bounds[key]
-            known = {k: v for k, v in bounds.items() if k != "certify_seconds"}
-            return known, objection
-        self._bounds[key] = certified(case, s)
-        return self._bounds[key]
+        return {"fields": finite(results), "notes": notes}
 
     def _case(self, name: CaseId, keep: int) -> Case:
         case = self._cases.pop(name.name, None)
@@ -130,7 +108,7 @@ class Cases:
         while len(self._cases) >= keep:
             del self._cases[next(iter(self._cases))]
         if case is None:
-            self._bounds.clear()
+            self._results.clear()
             case = self._build(name)
             if not self._warm and case.dualise_seconds is not None:
                 self._warm = True

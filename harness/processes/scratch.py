@@ -9,9 +9,10 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
+from time import time
 
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.locks import file_lock
@@ -19,6 +20,9 @@ from mortarbench.harness.processes.solver_file import write_solver
 from mortarbench.harness.processes.supervisor import WorkerProcess
 
 _SCRATCH = "mortarbench-tmp-"
+#: age of folders without a lock from which on they are removed; a new folder is locked
+#: after its creation
+STALE_SECONDS = 60.0
 
 
 @contextmanager
@@ -55,19 +59,16 @@ def scratch_folder() -> Iterator[Path]:
     """Create a folder for temporary files, removed at the end of the context.
 
     Each process holds a lock on its folder, which the kernel releases when the process
-    ends. Folders without a lock were left behind by killed processes, and are removed.
+    ends. Folders without a lock that are older than `STALE_SECONDS` were left behind by
+    killed processes, and are removed.
     """
     for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
         # the folder is in use, or belongs to another user
         with suppress(OSError), file_lock(stale, flags=os.O_DIRECTORY, waits=False):
-            shutil.rmtree(stale)
-    while True:
-        with TemporaryDirectory(prefix=_SCRATCH) as name, ExitStack() as stack:
-            folder = Path(name)
-            with suppress(FileNotFoundError):
-                stack.enter_context(file_lock(folder, flags=os.O_DIRECTORY))
-            # Before the new folder is locked, another process may treat it as abandoned
-            # and remove it. In this case, another folder is created.
-            if folder.exists():
-                yield folder
-                return
+            if time() - stale.stat().st_mtime > STALE_SECONDS:
+                shutil.rmtree(stale)
+    with (
+        TemporaryDirectory(prefix=_SCRATCH) as name,
+        file_lock(Path(name), flags=os.O_DIRECTORY),
+    ):
+        yield Path(name)

@@ -72,8 +72,6 @@ class MeasurementFault:
 
     record: Record  #: incomplete record of the missing measurement
     reason: str  #: reason in one line
-    #: True if the measurement is repeated, which yields a further outcome
-    tried_again: bool
 
 
 Outcome = Result | BuildFailure | MeasurementFault

@@ -93,7 +93,7 @@ class Executor:
         from step to step are lost. No result is yielded twice.
         """
         measured: set[str] = set()  # run IDs of measurements with a result
-        for tried_again in (True, False):
+        for _ in range(2):
             try:
                 for result in self._results(block, turn):
                     if result.record.run_id not in measured:
@@ -109,11 +109,9 @@ class Executor:
             with suppress(FileNotFoundError):  # the entire result folder was deleted
                 self.scratch.mkdir(exist_ok=True)
             self._worker(label).close()
-            missing = [record for record in turn if record.run_id not in measured]
-            for record in missing[: 1 if tried_again else None]:
-                yield MeasurementFault(
-                    record=record, reason=reason, tried_again=tried_again
-                )
+        for record in turn:
+            if record.run_id not in measured:
+                yield MeasurementFault(record=record, reason=reason)
 
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
@@ -214,12 +212,7 @@ class Executor:
         notes: list[str]
         try:
             answer = self._ask_case_worker(request)
-            notes = answer["notes"]
-            record = record.replace(
-                quantities=answer["quantities"],
-                recover_seconds=answer["seconds"],
-                **answer["bounds"],
-            )
+            record, notes = record.replace(**answer["fields"]), answer["notes"]
         except _BuildError as e:
             notes = [f"no quantities: {e.reason}"]
         stored = read_arrays(fields, ()) if fields.exists() else None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
@@ -128,7 +129,7 @@ def run(
             with contextlib.closing(outcomes):
                 for outcome in outcomes:
                     recorder.take(outcome)
-        return Missing(unbuilt=schedule.unbuilt, faults=recorder.remaining_faults())
+        return Missing(unbuilt=schedule.unbuilt, faults=recorder.faults)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -139,8 +140,7 @@ class _Recorder:
     journal: Journal
     schedule: Schedule
     progress: Progress
-    _counted: set[str] = field(default_factory=set)  # run IDs reported to `progress`
-    _faults: dict[str, str] = field(default_factory=dict)  # last fault by run ID
+    faults: list[str] = field(default_factory=list)  #: reasons of missing measurements
 
     def take(self, outcome: Outcome) -> None:
         """Store one result, or the reason why it is missing.
@@ -160,24 +160,19 @@ class _Recorder:
             case BuildFailure():
                 if self.schedule.give_up(outcome.block):
                     self.progress.warn(outcome.reason)
-                for turn in outcome.block.turns:
-                    for record in turn:
-                        self._count(record, None)
+                for _ in chain.from_iterable(outcome.block.turns):
+                    self.progress.advance(None)
             case MeasurementFault():
-                self._take_fault(outcome)
+                record = outcome.record
+                fault = f"{record.solver} on {record.case}: {outcome.reason}"
+                self.progress.warn(f"{fault}; it was not measured")
+                self.faults.append(fault)
+                self.progress.advance(None)
             case Result() if self.schedule.is_measured(outcome.record.run_id):
                 # a repetition of a block or sequence: only the first result counts
-                self._count(outcome.record, None)
+                self.progress.advance(None)
             case Result():
                 self._take_result(outcome)
-
-    def remaining_faults(self) -> list[str]:
-        """List the last fault of each measurement that is still missing."""
-        return [
-            fault
-            for run_id, fault in self._faults.items()
-            if not self.schedule.is_measured(run_id)
-        ]
 
     def _take_result(self, result: Result) -> None:
         record = result.record
@@ -188,22 +183,7 @@ class _Recorder:
             record = record.replace(fields=save(self.out, result.fields))
         self.journal.append(record)
         self.schedule.add(record)
-        self._count(record, record)
-
-    def _take_fault(self, unmade: MeasurementFault) -> None:
-        record, what = unmade.record, unmade.reason
-        fault = f"{record.solver} on {record.case}: {what}"
-        then = "it is tried again" if unmade.tried_again else "it was not measured"
-        self.progress.warn(f"{fault}; {then}")
-        if not unmade.tried_again:
-            self._faults[record.run_id] = fault
-            self._count(record, None)
-
-    def _count(self, record: Record, result: Record | None) -> None:
-        """Report a cell as done, only once even if it has several outcomes."""
-        if record.run_id not in self._counted:
-            self._counted.add(record.run_id)
-            self.progress.advance(result)
+        self.progress.advance(record)
 
 
 def _check_same(

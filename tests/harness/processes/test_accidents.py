@@ -1,10 +1,8 @@
 """Solvers that disturb a run by accident, and verdicts on other solvers of the run."""
 
-import fcntl
 import os
 import re
 import secrets
-import shutil
 import signal
 import subprocess
 import sys
@@ -400,29 +398,9 @@ def test_scratch_folders_of_killed_processes_are_removed_at_the_next_start(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     stale = tmp_path / "mortarbench-tmp-1"
     stale.mkdir()
+    os.utime(stale, (0, 0))
     with scratch_folder() as used, scratch_folder():
         assert sorted(tmp_path.iterdir()).count(used) == 1
         assert not stale.exists()
-
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_scratch_folder_deleted_before_it_is_locked_is_replaced(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    gone = []
-
-    def taken_for_stale(lock, how):
-        if not gone:
-            gone.extend(tmp_path.iterdir())
-            shutil.rmtree(gone[0])
-        return flock(lock, how)
-
-    flock = fcntl.flock
-    monkeypatch.setattr(fcntl, "flock", taken_for_stale)
-    with scratch_folder() as used:
-        assert used.is_dir()
-        assert [used] != gone
 
     assert list(tmp_path.iterdir()) == []
