@@ -119,25 +119,15 @@ class HalfSpace(Family):
     def _check_law(self) -> None:
         """Raise InputError if law, friction and their parameters are incompatible."""
         law, friction = self.law, self.friction
-        if law == "mindlin":
-            refuse_unused(
-                self,
-                "friction",
-                "law=mindlin, Coulomb's law with the exact pressure",
-                "law=hertz",
-            )
-        if law == "rough" and friction != "none":
-            raise InputError(
-                f"friction={friction} with law=rough is not built; expected no "
-                "friction, or law=hertz"
-            )
         if law == "rough" and self.n < MIN_ROUGH:
             raise InputError(
                 f"n={self.n} must be at least {MIN_ROUGH} for law=rough, two cells per "
                 "shortest wavelength"
             )
         coulomb = law == "mindlin" or friction == "coulomb"
+        choice = f"law={law}" + f" with friction={friction}" * (law == "hertz")
         users = {
+            "friction": (law == "hertz", "law=hertz"),
             "seed hurst roughness": (law == "rough", "law=rough"),
             "Q": (coulomb or friction == "tresca", "law=mindlin or friction=coulomb"),
             "mu": (coulomb, "law=mindlin or friction=coulomb"),
@@ -146,9 +136,7 @@ class HalfSpace(Family):
         for keys, (is_used, user) in users.items():
             for key in keys.split():
                 if not is_used:
-                    refuse_unused(
-                        self, key, f"law={law} with friction={friction}", user
-                    )
+                    refuse_unused(self, key, choice, user)
         if friction == "tresca" and self.bound not in POSITIVE:
             given = "" if self.bound == UNSET else f", got {self.bound:g}"
             raise InputError(

@@ -91,7 +91,7 @@ REFUSED = {
         ("seed=1", "seed=1 is not used by law=hertz"),
         ("law=mindlin/roughness=0.1", "roughness=0.1 is not used by law=mindlin"),
         ("law=mindlin/friction=coulomb", "expected no friction, or law=hertz"),
-        ("law=rough/friction=tresca", "friction=tresca with law=rough is not"),
+        ("law=rough/friction=tresca", "friction=tresca is not used by law=rough;"),
         ("law=rough/n=32", "n=32 must be at least 64 for law=rough"),
         ("friction=tresca", "friction=tresca needs bound, a traction"),
         ("friction=tresca/bound=1/mu=0.2", "mu=0.2 is not used"),
