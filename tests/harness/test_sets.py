@@ -186,7 +186,7 @@ def test_blocks_are_substituted_with_their_variables(rng):
             same = [limit.slack >= 0 for limit in other.limits(there)]
             assert np.array_equal(is_in, same)
         with pytest.raises(ValueError, match="cannot be shifted"):
-            one.substituted(T, np.ones(N))
+            one.substituted(T, np.eye(N)[one.index[0, 1]])
         factors[one.index[0, 2:]] *= 3
         factors[one.index[0, -1]] *= -3
         T = csr_array((factors, (np.arange(N), order)), shape=(N, N))

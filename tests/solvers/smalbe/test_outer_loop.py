@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness import QP, Discs, Status, no_rows
 from mortarbench.solvers.smalbe import driver
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.projected import (
@@ -126,3 +126,15 @@ def test_a_distant_feasible_point_is_detected_in_every_unit(unit):
     bounds = (unit * np.array([2.0, -np.inf]) - rows.x_tilde, np.full(2, np.inf))
 
     assert not infeasible(rows, bounds, unit * np.array([2.0, 0.0]) - rows.x_tilde)
+
+
+def test_the_box_around_discs_is_that_of_x_shifted_by_a_point_of_the_rows():
+    qp = QP.from_arrays(
+        np.eye(3), np.ones(3), A=np.ones((1, 3)), b=3, lb=[-np.inf, -np.inf, 0],
+        sets=[Discs([[0, 1]], [2])],
+    )  # fmt: skip
+    problem = problem_of(qp)
+    lower, upper = (bound + problem.rows.x_tilde for bound in problem.hull)
+
+    assert lower == pytest.approx([-2, -2, 0])
+    assert upper == pytest.approx([2, 2, np.inf])
