@@ -369,11 +369,6 @@ class Exact(NamedTuple):
         """Return v = Bu − c (m,), the penetration or the slip in each row."""
         return np.asarray(self.B @ u - self.c)
 
-    def friction_work(self, u: Extended) -> Extended:
-        """Return the friction work gᵢ‖vᵢ‖ of each friction vector."""
-        discs = self.forces.discs
-        return np.asarray(discs.radius * norms(self.motion(u)[discs.index]))
-
     def missing_work(
         self, multipliers: Extended, motion: Extended
     ) -> tuple[Extended, Extended]:
@@ -632,8 +627,6 @@ class Mechanics:
     rigid: NDArray[np.float64]
     #: names of the bodies, in the order of their columns in `rigid`
     names: tuple[str, ...] = ()
-    scale: float = 1.0  #: energy = scale·(objective of `primal`) + constant
-    constant: float = 0.0
     #: mesh of u, from which the size of each body follows; None if u is not a
     #: displacement of bodies
     grid: Grid | None = None
@@ -696,15 +689,6 @@ class Mechanics:
     def whole(self) -> Mechanics:
         """The same problem, with certificates from the assembled K."""
         return self if self.subdomains is None else replace(self, subdomains=None)
-
-    def energy(self, u: Extended) -> float:
-        """Return the potential energy of `u` (n,), including friction, in SI units.
-
-        The terms are summed in extended precision.
-        """
-        objective = 0.5 * (u @ (self.stiffness @ u)) - self.exact.f @ u
-        objective = objective + self.exact.friction_work(u).sum()
-        return float(self.scale * objective + self.constant)
 
     @cached_property
     def motions(self) -> RigidMotions:

@@ -174,8 +174,6 @@ def contact_case(
             factorise=lambda: bodies.supported,
             rigid=bodies.rigid,
             names=bodies.piece_names,
-            scale=energy,
-            constant=energy * float(lift @ (0.5 * (primal.P @ lift) + primal.q)),
             grid=Grid(
                 bodies.mesh.points,
                 bodies.mesh.cells,

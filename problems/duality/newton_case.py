@@ -130,7 +130,7 @@ def newton_case(
         quantities=collected,
     )
     assert case.mechanics is not None
-    to_primal, constant = case.mechanics.to_primal, at.constant * unit
+    to_primal = case.mechanics.to_primal
 
     def deformed_fields(s: Solution) -> Fields:
         s = to_primal(s)
@@ -140,10 +140,8 @@ def newton_case(
     return replace(
         case,
         fields=deformed_fields,
-        constant=case.constant + constant,
-        mechanics=replace(
-            case.mechanics, constant=constant, rigid=translations(bodies)
-        ),
+        constant=case.constant + at.constant * unit,
+        mechanics=replace(case.mechanics, rigid=translations(bodies)),
     )
 
 

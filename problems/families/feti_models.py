@@ -270,7 +270,6 @@ class Obstacle(DecomposedFamily):
                 factorise=problem.factorise,
                 rigid=np.zeros((size, 0)),
                 subdomains=subdomains,
-                constant=datum,
             ),
         )
 
@@ -823,7 +822,6 @@ class Plate(DecomposedFamily):
                 factorise=self.factorise,
                 rigid=rigid_modes(mesh.points),
                 names=("plate",),
-                scale=unit,
                 grid=Grid(mesh.points, mesh.cells, np.zeros(cells, dtype=np.int64)),
                 subdomains=subdomains,
             ),
