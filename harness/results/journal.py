@@ -74,16 +74,15 @@ class Journal:
             If the file is not at its path, or has another size.
 
         """
-        there = self._path.stat() if self._path.is_file() else None
         held = os.fstat(self._fd)
-        if there is None or not os.path.samestat(there, held):
-            change = "moved or deleted"
-        elif held.st_size != self._size:
-            change = "changed"
-        else:
+        if (
+            self._path.is_file()
+            and os.path.samestat(self._path.stat(), held)
+            and held.st_size == self._size
+        ):
             return
         raise InputError(
-            f"{self._path} was {change} by another program during the run; the same "
+            f"{self._path} was moved, deleted or changed during the run; the same "
             "command continues with the lines that are there"
         )
 

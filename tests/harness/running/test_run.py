@@ -397,7 +397,7 @@ def test_a_run_ends_if_its_journal_is_moved_or_deleted(measure, tmp_path, lost, 
     def lose():
         path.rename(there) if moved else shutil.rmtree(path)
 
-    with pytest.raises(InputError, match="was moved or deleted by another program"):
+    with pytest.raises(InputError, match="was moved, deleted or changed"):
         measure(suite("honest", "zero"), out=out, after=1, act=lose)
     if moved:
         shutil.rmtree(path, ignore_errors=True)
