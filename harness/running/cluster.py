@@ -46,7 +46,7 @@ from mortarbench.harness.running.executor import execute
 LOCAL = "local"
 CONNECT_SECONDS = 10  #: time limit for connecting
 CLUSTER_POLL_SECONDS = 2.0  #: longest time between two checks for lost workers
-LOST_SECONDS = 30.0  #: time in which the first worker may join, or a lost one return
+LOST_SECONDS = 60.0  #: time in which the first worker may join, or a lost one return
 
 #: keys of an environment in which all nodes must agree to run the same code
 _CODE = ("source", "versions.mortarbench", "plugins")

@@ -366,7 +366,7 @@ def test_a_block_that_kills_every_worker_is_abandoned_and_others_are_measured(
         "--solver", "exact", "--solver", "murders",
     )  # fmt: skip
 
-    assert code == 1
+    assert code == 1, err
     assert "well/depth=4/dual was given up" in err
     assert "1 case could not be built: well/depth=4/dual" in out
     made = {(r.solver, r.params["depth"]) for r in read_journal(tmp_path / "d")}
