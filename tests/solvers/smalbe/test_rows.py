@@ -13,7 +13,11 @@ from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers.smalbe import rows as module
 from mortarbench.solvers.smalbe.compiled import Rows
 from mortarbench.solvers.smalbe.driver import outer_loop
-from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
+from mortarbench.solvers.smalbe.projected import (
+    by_lanczos,
+    projected_problem,
+    unchanged,
+)
 from mortarbench.solvers.smalbe.rows import (
     DenseRows,
     SparseRows,
@@ -233,3 +237,13 @@ def test_a_right_hand_side_of_rounding_size_counts_as_zero(G):
         assert np.linalg.norm(G @ inside) < size
         assert Rows(rows).met(inside, 1e-8, 0.0)
         assert not Rows(rows).met(nu, 1e-8, 0.0)
+
+
+def test_rows_of_an_earlier_problem_are_those_of_an_equal_matrix():
+    dense = np.eye(2, 3)
+    sparse = csr_array(dense)
+    for one, other in ((dense, sparse), (sparse, dense)):
+        assert unchanged(one, one)
+        assert unchanged(one, one.copy())
+        for different in (2 * one, np.eye(2, 4), csr_array(np.eye(2, 4)), other):
+            assert not unchanged(one, different)
