@@ -20,7 +20,11 @@ from mortarbench.problems.feti.operator_arrays import (
     dual_operator,
     dual_operator_from_arrays,
 )
-from mortarbench.problems.feti.operators import block_pseudoinverse, explicit_classes
+from mortarbench.problems.feti.operators import (
+    block_bytes,
+    block_pseudoinverse,
+    explicit_classes,
+)
 from mortarbench.problems.feti.served import Served
 from mortarbench.problems.feti.subdomains import TornBodies
 from mortarbench.problems.feti.tearing import blocks
@@ -165,6 +169,9 @@ def test_blocks_stored_as_one_triangle_have_the_same_products():
     apart = dual_operator(replace(of_both, domains=two, explicit=explicit))
     x = np.random.default_rng(3).standard_normal((pair.torn.rows.c.size, 2))
 
+    # two triangles of 6 doubles in each class, or two blocks of 9 doubles
+    assert block_bytes(np.array([3, 3]), two).tolist() == [96, 96]
+    assert block_bytes(np.array([3]), pair.domains).tolist() == [144]
     assert_allclose(apart @ x, F @ x, rtol=1e-11, atol=1e-13)
     for name in KINDS:
         M, of_two = (f.build().preconditioner(name, "stiffness") for f in (F, apart))
