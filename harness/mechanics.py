@@ -25,9 +25,7 @@ from scipy.sparse import (
 
 from mortarbench.harness.qp import QP, Matrix, Vector, no_rows
 from mortarbench.harness.sets.blocks import norms
-from mortarbench.harness.sets.box import Box
 from mortarbench.harness.sets.cones import Cones
-from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution
 
@@ -295,12 +293,6 @@ class AdmissibleForces:
     def contact(self) -> NDArray[np.bool_]:
         """Mask (m,) of the contact rows."""
         return np.arange(self.rows) < self.rows - self.discs.index.size
-
-    @property
-    def sets(self) -> tuple[ConvexSet, ...]:
-        """The set Λ as a box and discs, as in the attribute `sets` of a QP."""
-        upper = np.full(self.rows, np.inf)
-        return Box(np.where(self.contact, 0.0, -upper), upper), self.discs
 
     def project(self, multipliers: Extended) -> Extended:
         """Return the nearest admissible multipliers (m,)."""

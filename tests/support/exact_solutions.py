@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from mortarbench.harness import Case, Mechanics, Solution, Status
-from mortarbench.harness.mechanics import Extended, Real
-from mortarbench.harness.sets.convex import hull
+from mortarbench.harness.mechanics import Exact, Extended, Real
 from mortarbench.harness.verify.admissible import closing
 from mortarbench.harness.verify.certificate import Certificate, proof, suggested
 from mortarbench.harness.verify.substructured import Split
@@ -199,7 +198,7 @@ def _given(
     """Solve for u and λ with equality on the closed rows."""
     exact, primal = mechanics.exact, mechanics.primal
     K, B = primal.P.toarray(), mechanics.rows.toarray()
-    lower, upper = hull(exact.forces.sets, exact.c.size)
+    lower, upper = _limits(exact)
     free, closed = np.setdiff1d(np.arange(len(K)), exact.fixed), states == CLOSED
     lam = np.where(states == LOWER, lower, np.where(states == UPPER, upper, 0))
     rows = B[closed][:, free]
@@ -232,7 +231,7 @@ def _exchanged(
     zero_v = max(abs(x) for x in u) >> (FINE - 60) if u.size else 0
     zero = max((abs(x) for x in lam), default=0) >> (FINE - 60)
     bounded = ~exact.contact
-    least, most = hull(exact.forces.sets, lam.size)
+    least, most = _limits(exact)
     lower, upper = integers(least), np.zeros(lam.size, dtype=object)
     upper[bounded] = integers(most[bounded])
     found = states.copy()
@@ -245,6 +244,13 @@ def _exchanged(
         elif (state == LOWER and v[i] > zero_v) or (state == UPPER and v[i] < -zero_v):
             found[i] = CLOSED
     return found
+
+
+def _limits(exact: Exact) -> tuple[Any, Any]:
+    """Return the bounds (m,) of the multipliers, each with all others zero."""
+    discs, upper = exact.forces.discs, np.full(exact.c.size, np.inf)
+    upper[discs.index] = discs.radius[:, None]
+    return np.where(exact.contact, 0, -upper), upper
 
 
 def _solve(A: NDArray[np.float64], b: Integers) -> Integers:
