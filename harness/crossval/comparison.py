@@ -139,7 +139,8 @@ def compare_answers(answers: Sequence[StoredAnswer], solve: Reference) -> list[A
     solve : function that solves a QP accurately
     """
     try:  # the smallest form of the problem is solved
-        reference = _reference(min((g.case for g in answers), key=_size), solve)
+        smallest = min((g.case for g in answers), key=lambda case: case.qp.q.size)
+        reference = _reference(smallest, solve)
     except Exception as e:  # also raised by code of the family
         return [_judged(g, note_of("reference", e)) for g in answers]
     judged: list[Answer] = []
@@ -168,10 +169,6 @@ def compare_answers(answers: Sequence[StoredAnswer], solve: Reference) -> list[A
             )
         )
     return judged
-
-
-def _size(case: Case) -> int:
-    return case.qp.q.size
 
 
 def _reference(case: Case, solve: Reference) -> _Reference:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import json
 import os
 import resource
 import warnings
@@ -11,7 +10,6 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.errors import InputError
@@ -123,21 +121,3 @@ def at_most(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def json_object(text: str | bytes) -> dict[str, Any]:
-    """Parse the JSON object in the field ``meta`` of a data file.
-
-    Raises
-    ------
-    ValueError
-        If `text` is not a JSON object, or is nested too deeply for Python's parser.
-
-    """
-    try:
-        data = json.loads(text)
-    except RecursionError:
-        raise ValueError("meta is nested too deeply") from None
-    if not isinstance(data, dict):
-        raise ValueError("meta is not a JSON object")
-    return data

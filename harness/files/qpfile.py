@@ -41,7 +41,6 @@ from scipy.sparse import csc_array, issparse
 
 from mortarbench.harness.checked import located
 from mortarbench.harness.errors import InputError, shortened, unknown
-from mortarbench.harness.files.datafile import json_object
 from mortarbench.harness.files.durable import writing
 from mortarbench.harness.files.mapped import read_mapped, write_mapped
 from mortarbench.harness.files.reading import check_size
@@ -206,7 +205,13 @@ def _meta(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     array = arrays.get("meta", np.array("{}"))
     if array.dtype.kind != "U" or array.size != 1:
         raise ValueError("meta is not a string")
-    return json_object(str(array.item()))
+    try:
+        data = json.loads(str(array.item()))
+    except RecursionError:
+        raise ValueError("meta is nested too deeply") from None
+    if not isinstance(data, dict):
+        raise ValueError("meta is not a JSON object")
+    return data
 
 
 def _serialised_qp(

@@ -140,27 +140,21 @@ def evaluated(case: Case, s: Solution, tol: float) -> tuple[dict[str, Any], list
 
 
 def results_of(case: Case, s: Solution) -> tuple[dict[str, Any], list[str]]:
-    """Return quantities and error bounds as fields of a record, and notes."""
-    start = perf_counter()
-    quantities, note = quantities_of(case, s)
+    """Return quantities and error bounds as fields of a record, and notes on failures.
+
+    There are none if the answer has no finite point.
+    """
+    if not has_point(s):
+        return {}, []
+    start, note = perf_counter(), ""
+    try:
+        with np.errstate(all="ignore"):  # a point may contain 1e300
+            quantities = plain(case.quantities(s))
+    except Exception as e:  # an error of the family must not discard the record
+        quantities, note = {}, note_of("quantities", e)
     fields = {"quantities": quantities, "recover_seconds": perf_counter() - start}
     bounds, objection = certified(case, s)
     return fields | bounds, [note, objection]
-
-
-def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
-    """Return the physical quantities of a point, and a note on failure.
-
-    The note is empty on success. Quantities and note are empty if the answer has no
-    finite point.
-    """
-    if not has_point(s):
-        return {}, ""
-    try:
-        with np.errstate(all="ignore"):  # a point may contain 1e300
-            return plain(case.quantities(s)), ""
-    except Exception as e:  # an error of the family must not discard the record
-        return {}, note_of("quantities", e)
 
 
 def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
@@ -178,8 +172,6 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     `least_eigenvalue`, the error of x is bounded in the norm of P
     (`certify_by_eigenvalue`).
     """
-    if not has_point(s):
-        return {}, ""
     mechanics = case.mechanics
     if mechanics is None and case.certifiable is None:
         least = getattr(case.qp.P, "least_eigenvalue", None)
