@@ -16,7 +16,6 @@ from __future__ import annotations
 import os
 import re
 import stat
-import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -145,11 +144,8 @@ def toml(text: str) -> dict[str, Any]:
         raise InputError(f"{place}: {what}") from None
     except RecursionError:
         raise _too_deep() from None
-    except ValueError:  # Python limits the number of digits of an integer
-        raise InputError(
-            "an integer with too many digits; expected at most "
-            f"{sys.get_int_max_str_digits()}"
-        ) from None
+    except ValueError as e:  # Python limits the number of digits of an integer
+        raise InputError(str(e)) from None
     return table
 
 
