@@ -211,9 +211,8 @@ class Fields:
     cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
     displacement: NDArray[Any]  #: (N, dim) displacement of each node, m
-    nodal: Mapping[str, Vector] = field(
-        default_factory=dict
-    )  #: nodal results by name, e.g. von_mises (N,), Pa
+    #: nodal results by name, e.g. von_mises (N,), Pa
+    nodal: Mapping[str, Vector] = field(default_factory=dict)
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
     #: (c, dim) force on each slave node: N/m in 2D, N in 3D
     contact_forces: NDArray[Any] | None = None
@@ -253,9 +252,8 @@ class Case:
     fields: Callable[[Solution], Fields] | None = None
     scale: float = 1.0
     constant: float = 0.0
-    matrices: Mapping[str, Any] = field(
-        default_factory=dict
-    )  #: matrices by name that are exported with the QP
+    #: matrices by name that are exported with the QP
+    matrices: Mapping[str, Any] = field(default_factory=dict)
     #: time to form the dual, including the factorisation; None for other forms
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: elastic problem, needed to certify errors

@@ -427,14 +427,9 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, Any]) -> Registr
 
 def _refuse_taken(what: str, known: Mapping[str, Any], new: Mapping[str, Any]) -> None:
     if both := sorted(known.keys() & new.keys()):
-        remedy = (
-            "label its plug-in by --plugin LABEL=FILE.py"
-            if what == "solver"
-            else "load one of the two"
-        )
         raise InputError(
             f"{what} {both[0]!r} of the plug-in already exists; rename the new one, or "
-            f"{remedy}"
+            "label the solvers of a plug-in by --plugin LABEL=FILE.py"
         )
 
 

@@ -88,9 +88,8 @@ class Solution:
     z_box: Vector
     #: number of iterations; None if the solver does not report it
     iterations: int | None = None
-    counts: Mapping[str, int] = field(
-        default_factory=dict
-    )  #: numbers of operations by name, e.g. {"P_products": 61}
+    #: numbers of operations by name, e.g. {"P_products": 61}
+    counts: Mapping[str, int] = field(default_factory=dict)
     message: str = ""  #: message of the solver, stored in the record
     #: other data from the solver by name, e.g. {"linear_solver": "qdldl",
     #: "setup_seconds": 0.01}

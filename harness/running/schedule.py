@@ -36,16 +36,12 @@ class Schedule:
     progress: Progress
     #: names of the cases that could not be built
     unbuilt: list[str] = field(default_factory=list)
-    _declined: set[tuple[str, Cell]] = field(
-        default_factory=set
-    )  # solver and cell of each declined case
-    #: solver and cell of each case beyond a limit, see `add`
-    _beyond: set[tuple[str, Cell]] = field(default_factory=set)
+    #: solver and cell of each case that it declined, or that is beyond a limit
+    _omitted: set[tuple[str, Cell]] = field(default_factory=set)
     #: number of variables by name of the case, for measured cases
     _variables: dict[str, int] = field(default_factory=dict)
-    _done: set[str] = field(
-        default_factory=set
-    )  # run IDs of the measurements in the journal
+    #: run IDs of the measurements in the journal
+    _done: set[str] = field(default_factory=set)
     _next: int = 0  # number of the next new block
 
     @property
@@ -65,7 +61,7 @@ class Schedule:
         if "variables" in record.sizes:
             self._variables[record.case] = record.sizes["variables"]
         if record.status is Verdict.DECLINED:
-            self._declined.add((record.solver, _cell(record)))
+            self._omitted.add((record.solver, _cell(record)))
         if record.status in LIMITS and record.mode == "cold":
             size, params = self._variables.get(record.case, 0), record.params
             alike = [
@@ -81,7 +77,7 @@ class Schedule:
             for c in alike:
                 if larger_keys(params, c.params) in growing - {frozenset()}:
                     cell = (record.mode, c.name, record.tol)
-                    self._beyond.add((record.solver, cell))
+                    self._omitted.add((record.solver, cell))
 
     def is_settled(self, record: Record) -> bool:
         """Return True if a measurement is in the journal, or is not needed.
@@ -89,7 +85,7 @@ class Schedule:
         A solver that declined a case would decline it in every repeat.
         """
         cell = record.solver, _cell(record)
-        return record.run_id in self._done or cell in self._declined | self._beyond
+        return record.run_id in self._done or cell in self._omitted
 
     def is_measured(self, run_id: str) -> bool:
         """Return True if the measurement is in the journal."""

@@ -111,12 +111,8 @@ def selected(
         if name not in known:
             check_name(name, solvers, labels=known)
             known[name] = SolverSpec(name=name, label=name)
-    null = [
-        label
-        for label in known
-        if label not in names and label.removesuffix(NULL_SUFFIX) in names
-    ]
-    return tuple(known[name] for name in dict.fromkeys([*names, *null]))
+    twins = [f"{name}{NULL_SUFFIX}" for name in names]
+    return tuple(known[n] for n in dict.fromkeys([*names, *twins]) if n in known)
 
 
 def sweep(

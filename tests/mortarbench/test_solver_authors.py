@@ -117,7 +117,7 @@ def test_the_error_for_versions_without_labels_mentions_labels(cli, versions):
     assert code == 2
     assert err == (
         "mortarbench: new/mine.py: solver 'mine' of the plug-in already exists; rename "
-        "the new one, or label its plug-in by --plugin LABEL=FILE.py\n"
+        "the new one, or label the solvers of a plug-in by --plugin LABEL=FILE.py\n"
     )
 
 
