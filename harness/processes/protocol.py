@@ -72,17 +72,13 @@ def answer_requests(
                 send("warm" if "warm_up" in request else "done", **reply)
 
 
-class ForeignReplyError(Exception):
-    """Error for a reply that violates the protocol; the message quotes its start."""
-
-
 def event_of(line: bytes, expected: str) -> dict[str, Any]:
     """Check that a reply is the expected event or "fault", and return its entries.
 
     Raises
     ------
-    ForeignReplyError
-        If the line is not one of these two events.
+    ValueError
+        If the line is not one of these two events; the message quotes its start.
 
     """
     reply = None
@@ -91,6 +87,6 @@ def event_of(line: bytes, expected: str) -> dict[str, Any]:
     if isinstance(reply, dict) and reply.get("event") in (expected, "fault"):
         return reply
     text = repr(line[: 2 * MAX_EXCERPT_CHARACTERS].decode(errors="backslashreplace"))
-    raise ForeignReplyError(
+    raise ValueError(
         f"{shortened(text, MAX_EXCERPT_CHARACTERS)} was received, expected {expected!r}"
     )

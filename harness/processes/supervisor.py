@@ -40,7 +40,6 @@ from mortarbench.harness.processes import parent
 from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.protocol import (
     MAX_REPLY_BYTES,
-    ForeignReplyError,
     event_of,
 )
 from mortarbench.harness.record import Verdict
@@ -363,7 +362,7 @@ class WorkerProcess:
         line, _, self._unread = self._unread.partition(b"\n")
         try:
             reply = event_of(line, event)
-        except ForeignReplyError as e:
+        except ValueError as e:
             raise ended(Verdict.FAILED, str(e)) from None
         if reply.pop("event") == "fault":
             raise ended(Verdict.FAILED, reply["what"], is_fault=True)

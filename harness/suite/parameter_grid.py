@@ -159,9 +159,6 @@ def expand_problems(
 
 def _params(problem: Problem, folder: Path, family: Family) -> dict[str, Any]:
     """Return the keys that an entry sets, with the files that its paths denote."""
-    for key in problem.params:
-        if key not in family.params:
-            raise unknown("key", key, family.params, where=problem.family)
     if family.path_suffix is None or "path" not in problem.params:
         return problem.params
     path = _expanded(problem.params["path"], folder, family)
