@@ -50,11 +50,10 @@ TINY = float(np.finfo(float).tiny)
 #: smallest limit on Lanczos steps, unless the option `lanczos_steps` is smaller
 MIN_LANCZOS_STEPS = 5
 #: default penalty ρ. Because the models contain ρQ exactly, a large ρ costs no
-#: products. With 1e4, two or three outer iterations usually suffice
+#: products. With 1e4, two or three outer iterations usually suffice. If P provides a
+#: preconditioner, ρ is as large as rounding permits (`_start`): each multiplier step
+#: restarts CG, and a preconditioned CG converges fast
 RHO = 1e4
-#: default penalty ρ if P provides a preconditioner. Each multiplier step restarts CG,
-#: so fewer outer iterations save time for decomposed bodies with thousands of rows
-PRECONDITIONED_RHO = 1e6
 #: default penalty ρ with discs. Spectral steps do not use the model, and a larger ρ
 #: would worsen the conditioning of H
 RHO_ON_DISCS = 1.0
@@ -123,7 +122,7 @@ def prepared(
         if eliminates and plain and (small := eliminate_free(qp)) is not None:
             inner = prepared(small.qp, tol, options, carry)
             return partial(_solve_without_free, qp, tol, options, small, inner)
-    rho = options.rho or (PRECONDITIONED_RHO if preconditioned_operator(qp) else RHO)
+    rho = options.rho or (compiled.MAX_RHO if preconditioned_operator(qp) else RHO)
     history = History() if options.history else None
     if carry is not None and carry.solution.x.size != qp.q.size:
         carry = None
@@ -386,9 +385,7 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     problem.F.count += bool(problem.discs)  # `_residuals` takes another product
     letters = at.steps
     counts = {"P_products": problem.F.count, **problem.counts, "outer": len(at.outer)}
-    for letter, name in STEPS.items():
-        if letter in letters:
-            counts[name] = letters.count(letter)
+    counts |= {name: letters.count(k) for k, name in STEPS.items() if k in letters}
     solution = Solution(
         status=Status.SOLVED,
         x=x,

@@ -349,7 +349,7 @@ cdef class MPRGP:
                     continue
                 # Step 3. Expansion: the CG step would leave the set.
                 letter = self.expand(not has_expanded, max(inside, 1), began, trace)
-                self.layers = 0
+                self.layers //= 2
                 has_expanded = True
             if not letter:
                 return 0

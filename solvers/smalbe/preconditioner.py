@@ -47,12 +47,9 @@ Preconditioner = Literal[
 PRECONDITIONERS = get_args(Preconditioner)
 #: preconditioners with a matrix or operator M
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
-#: Largest number of pairs of entries in the columns of an incomplete factor, per entry
-#: of P. The number of pairs determines the cost of elimination. Meshes of more than 24³
-#: trilinear elements have more than two pairs per entry, and factors of these matrices
-#: cost twice the time that they save. With a limit of 1.5 instead of 2, two of 1800
-#: runs on random AᵀA failed at tol 1e-12.
-MAX_PAIRS = 2.0
+#: entries that a CG step with an incomplete factor reads, in units of the entries of P:
+#: one product, and two substitutions with a triangle each
+STEP = 2
 #: Smallest levels·spread^¼ (see `Sparsity`) for which a factor is used. The value was
 #: chosen on thirty string, obstacle, journal bearing and torsion problems of 20 to
 #: 20 000 unknowns. Below this value, a solve with a factor takes up to 2.8 times as
@@ -114,7 +111,7 @@ def resolved_preconditioner(
     if P is None:
         return "model"
     pays = P.levels * P.spread**0.25 >= MIN_DIFFICULTY
-    if pays and P.pairs <= MAX_PAIRS * qp.P.nnz:
+    if pays and P.pairs <= STEP * qp.P.nnz:
         return "incomplete"
     # On 20 Laplacians in mixed units with spreads of 1.5, 3 and 9, the diagonal takes
     # 0.86, 0.73 and 0.45 times as many products as the model. With a zero on the
@@ -136,11 +133,11 @@ def has_sparse_factor(qp: QP) -> bool:
     """Return True if an incomplete factor of the free block of P is cheap.
 
     A factor requires a sparse P with a positive diagonal. The QP must have bounds only,
-    because a factor of P does not include the penalty of rows. The columns of P must
-    have so few entries that a factor costs no more than several products.
+    because a factor of P does not include the penalty of rows. The factorisation must
+    not cost more than a CG step.
     """
     P = sparsity_of(qp)
-    return P is not None and P.pairs <= MAX_PAIRS * qp.P.nnz
+    return P is not None and P.pairs <= STEP * qp.P.nnz
 
 
 def sparsity_of(qp: QP) -> Sparsity | None:

@@ -84,11 +84,10 @@ def lanczos(Product F, Rows C, start, int steps):
     cdef Py_ssize_t i, k, n = F.n
     cdef int kept = 0, info = 0
     steps = min(steps, n - len(C.source.C))
-    cdef Room room = Room((steps + 2) * n + C.r + (steps + 4) * steps)
+    cdef Room room = Room((steps + 1) * n + C.r + (steps + 4) * steps)
     cdef double *basis = room.at
     cdef double *v = basis + steps * n
-    cdef double *Fv = v + n
-    cdef double *Cv = Fv + n
+    cdef double *Cv = v + n
     cdef double *diagonal = Cv + C.r
     cdef double *off = diagonal + steps
     cdef double *share = off + steps
@@ -102,13 +101,8 @@ def lanczos(Product F, Rows C, start, int steps):
     beta = sqrt(dot(v, v, n))
     for k in range(steps if beta else 0):
         copy_scaled(1 / beta, v, basis + k * n, n)
-        if C.exist:
-            memcpy(Fv, basis + k * n, n * sizeof(double))
-            C.project(Fv, Cv)
-            F.apply(Fv, v)
-            C.project(v, Cv)
-        else:
-            F.apply(basis + k * n, v)
+        F.apply(basis + k * n, v)
+        C.project(v, Cv)
         diagonal[k] = dot(basis + k * n, v, n)
         largest = fmax(largest, fabs(diagonal[k]))
         add(-diagonal[k], basis + k * n, v, n)

@@ -16,7 +16,7 @@ cdef bint step_by_factor(MPRGP at) except -1:
     Therefore neighbours in the graph of P, up to a distance of `layers` edges, are also
     released; a neighbour that the step would move out of the set stays at its bound. If
     at least half of the neighbours leave their bounds, the number of layers is doubled,
-    otherwise halved. The number is reset to zero after an expansion. With τ ≥ ‖H‖ and
+    otherwise halved, as it is after an expansion. With τ ≥ ‖H‖ and
     p = Π(x − g/τ) − x, the step to x + p would decrease the cost by at least −gᵀp/2,
     because gᵀp ≤ −τ‖p‖². A step that achieves less is replaced by a gradient projection
     step, which costs one more product.

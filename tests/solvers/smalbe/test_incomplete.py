@@ -348,9 +348,7 @@ def test_half_a_string_takes_about_a_fifth_of_the_products_of_permon():
 @pytest.mark.parametrize(
     ("case", "most"),
     [("journal-bearing/n=200/eccentricity=0.9", 50), ("string/n=10000", 120),
-     pytest.param("journal-bearing/n=300", 160, marks=pytest.mark.xfail(
-         reason="181 products", strict=True)),
-     ("obstacle/dim=2/n=257/shape=hemisphere", 100)],
+     ("journal-bearing/n=300", 160), ("obstacle/dim=2/n=257/shape=hemisphere", 100)],
 )  # fmt: skip
 def test_on_large_families_few_products_are_needed(case, most):
     qp = primal(case)
