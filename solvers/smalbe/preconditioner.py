@@ -143,13 +143,7 @@ def has_sparse_factor(qp: QP) -> bool:
 def sparsity_of(qp: QP) -> Sparsity | None:
     """Return the properties of a sparse P of a QP with bounds only, otherwise None."""
     P = qp.P
-    if (
-        isinstance(P, np.ndarray)
-        or not issparse(P)
-        or qp.b.size
-        or qp.h.size
-        or not qp.q.size
-    ):
+    if not issparse(P) or qp.b.size or qp.h.size or not qp.q.size:
         return None
     if len(qp.sets) > 1 or P.nnz >= 2**31:
         return None
