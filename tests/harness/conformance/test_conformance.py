@@ -263,18 +263,18 @@ def test_weaknesses_and_failures_are_listed_in_markdown(capsys, monkeypatch):
     assert failed == [f"- fail: {check}" for check in (units, few[2])]
 
 
-def test_solvers_can_be_selected_by_patterns(capsys, monkeypatch):
+def test_results_of_several_solvers_are_printed_as_json(capsys, monkeypatch):
     few = ("refuses a misspelt option", "keeps its answer: bounds, mirrored")
     monkeypatch.setattr(conformance, "CHECKS", few)
-    command("test-solver", "piqp-*", "sound", "--plugin", FAULTY_SOLVERS, "--json")
-    rows = json.loads(capsys.readouterr().out)
     named = ["piqp-dense", "piqp-sparse", "sound"]
+    command("test-solver", *named, "--plugin", FAULTY_SOLVERS, "--json")
+    rows = json.loads(capsys.readouterr().out)
     assert [row["solver"] for row in rows] == np.repeat(named, 2).tolist()
     for row in rows[1::2]:
         assert re.fullmatch(r"\d+ iterations, \d+ without the change", row["message"])
 
-    assert command("test-solver", "nobody*") == 2
-    assert "nobody*" in capsys.readouterr().err
+    assert command("test-solver", "nobody") == 2
+    assert "nobody" in capsys.readouterr().err
     assert command("test-solver", "piqp", "--json", "--markdown") == 2
 
 
