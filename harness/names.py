@@ -17,7 +17,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field
 
 from mortarbench.harness.checked import located
@@ -199,17 +199,10 @@ def _needed(family: Family, given: dict[str, Value]) -> dict[str, Value]:
     derived = [k for k in needed if keys[k].default is None and k != "path"]
     for key in derived:
         fewer = {k: v for k, v in needed.items() if k != key}
-        if _is_equal(family, fewer):
-            needed = fewer
+        with suppress(InputError):  # the family may refuse to do without the key
+            if family.with_keys(**fewer) == family:
+                needed = fewer
     return needed
-
-
-def _is_equal(family: Family, values: Mapping[str, Value]) -> bool:
-    """Return True if the values determine the same family, by its derived keys."""
-    try:
-        return family.with_keys(**values) == family
-    except InputError:
-        return False
 
 
 def _canonical(name: str, family: Family, needed: dict[str, Value], form: str) -> str:

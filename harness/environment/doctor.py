@@ -46,10 +46,6 @@ def advice(environment: Mapping[str, Any]) -> dict[str, str]:
             "stop other programs (top lists them) and wait until the load is below "
             f"{MAX_QUIET_LOAD}",
         ),
-        "source.dirty": (
-            values.get("source.dirty"),
-            "commit before you publish, so that others can measure the same code",
-        ),
     }
     return {key: text for key, (is_bad, text) in changes.items() if is_bad}
 

@@ -91,8 +91,7 @@ def capture(
 
 def packages_of(environment: Mapping[str, Any]) -> list[str]:
     """Return the names of the solvers' packages in the versions of an environment."""
-    common = ("python", *PACKAGES)
-    return [name for name in environment.get("versions", ()) if name not in common]
+    return [n for n in environment["versions"] if n not in ("python", *PACKAGES)]
 
 
 def digest(environment: Mapping[str, Any]) -> str:

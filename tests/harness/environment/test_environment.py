@@ -159,7 +159,6 @@ def test_a_quiet_machine_gets_no_advice(quiet):
         ("machine.cpu_limit", 0.5, "docker run --cpus=2"),
         ("machine.usable_cores", 1, "2 cores"),
         ("now.load", 0.6, "stop other programs"),
-        ("source.dirty", True, "commit"),
     ],
 )
 def test_each_problem_comes_with_advice(quiet, path, value, remedy):
