@@ -12,8 +12,6 @@ from mortarbench.solvers.smalbe.projected import Iterate, Projected
 Array = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
-MAX_RHO: float
-
 class Product:
     n: int
     count: int

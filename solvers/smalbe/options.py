@@ -30,8 +30,8 @@ class Options:
 
     expansion: Expansion = "model"  #: see `solvers.smalbe.options`
     preconditioner: Preconditioner = "auto"  #: see `solvers.smalbe.preconditioner`
-    #: penalty ρ, relative to ‖𝒫F𝒫‖; 0 selects 1 with discs, the largest ρ that rounding
-    #: permits if P provides a preconditioner, else 1e4
+    #: penalty ρ, relative to ‖𝒫F𝒫‖; 0 selects 1 with discs, 1e6 if P provides a
+    #: preconditioner, else 1e4
     rho: float = 0.0
     M: float = 1.0  #: initial M in units of ‖𝒫F𝒫‖; inner runs end at ‖g^P‖ ≤ M‖Cν‖
     beta: float = 0.5  #: multiplies M if the Lagrangian grows too little

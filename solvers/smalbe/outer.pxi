@@ -6,7 +6,7 @@
 # dominate the gradient. Without a limit, models become indefinite
 # (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`). With 1e3,
 # `test_a_stalled_multiplier_increases_the_penalty` fails.
-MAX_RHO = 1e10
+cdef double MAX_RHO = 1e10
 # Smallest τ of a model, relative to the norm. Steps are therefore at most 1e4 times as
 # long as the steps of ordinary gradient projection. With zero, an F of low rank leads
 # to τ = 0, so that no step is possible (`test_earlier_failures_do_not_recur`).
