@@ -154,13 +154,15 @@ def kkt_residuals(qp: QP, s: Solution) -> Residuals:
 
     Let r = Px + q + Aᵀy + Gᵀz⁺ + z_box without inadmissible multipliers, ℓ the least
     nonzero |b̂|, |ĥ|, finite bound or radius (without any, ‖q̂‖∞/max P̂ⱼⱼ or 1),
-    X = max(‖x̂‖∞, ℓ) and X̄ = max(‖x̂‖₂/√n, ℓ). The residuals are the largest of
+    X = max(‖x̂‖∞, ℓ) and X̄ = max(‖x̂‖₂/√n, ℓ). L is the largest of these lengths, and
+    of ‖q̂‖∞/max P̂ⱼⱼ (∞ if all vanish), so that a part of x that no datum determines,
+    such as a rigid motion, sets no unit of forces. The residuals are the largest of
 
     * primal: v̂ᵢ/max(|b̂ᵢ| + Σ|k̂ᵢⱼ||x̂ⱼ|, κᵢX), where v̂ᵢ is the violation of a row,
       bound or other set, and κᵢ is `OWN_FLOOR` if bᵢ ≠ 0 and `FLOOR` if bᵢ = 0
     * dual: φ/F, where φ is an entry of Dr, a multiplier z⁻ of the wrong sign or an
       inadmissible part of z_box, and F = max(‖P̂x̂‖∞, ‖q̂‖∞); or
-      max(φ/`FLOOR`, F)/(max P̂ⱼⱼ·X) if this is smaller, as near q = 0, Px = 0
+      max(φ/`FLOOR`, F)/(max P̂ⱼⱼ·min(X, L)) if smaller, as near q = 0, Px = 0
     * complementarity: |zᵢ(h − Gx)ᵢ|/ℰ, and the support gaps of bounds and sets
     * gap: |xᵀPx + qᵀx + bᵀy + hᵀz + σ(z_box)|/ℰ
 
@@ -204,13 +206,13 @@ def _sizes_at(qp: QP, x: Vector, Px: Vector) -> _Sizes:
     by = scaling_of(qp)
     pmax, size = _sup(by.D**2 * by.curvature), (x / by.D)[by.used]
     loads = by.D * qp.q
-    least = _length_unit(qp)
+    least, most = _length_units(qp)
     X, mean = max(_sup(size), least), max(_rms(size), least)
     F = max(_sup(by.D * Px), _sup(loads))
     return _Sizes(
         length=X,
         force=F,
-        natural_force=FLOOR * pmax * X or (0.0 if F else 1.0),
+        natural_force=FLOOR * pmax * min(X, most) or (0.0 if F else 1.0),
         energy=max(abs(float(x @ Px)), abs(float(qp.q @ x))),
         natural_energy=mean * (max(_rms(loads), pmax * mean) or 1.0),
     )
@@ -225,13 +227,13 @@ def lengths(qp: QP) -> Vector:
     return found[found > 0]
 
 
-def _length_unit(qp: QP) -> float:
-    """Return ℓ of `kkt_residuals`: the least length in the data of a QP."""
-    if (found := lengths(qp)).size:
-        return float(found.min())
-    by = scaling_of(qp)
+def _length_units(qp: QP) -> tuple[float, float]:
+    """Return ℓ and L of `kkt_residuals`, the least and largest length in the data."""
+    by, found = scaling_of(qp), lengths(qp)
     pmax = _sup(by.D**2 * by.curvature)
-    return _sup(by.D * qp.q) / pmax if pmax and qp.q.any() else 1.0
+    loaded = _sup(by.D * qp.q) / pmax if pmax else 0.0
+    least = float(found.min()) if found.size else loaded or 1.0
+    return least, max(float(found.max(initial=0)), loaded) or np.inf
 
 
 def units_at(qp: QP, x: Vector) -> tuple[Vector, float]:

@@ -110,6 +110,16 @@ def test_the_multiplier_of_the_opposite_bound_is_refuted(z):
     assert r.complementarity > 0.3
 
 
+@pytest.mark.parametrize("tol", [1e-4, 1e-8])
+@pytest.mark.parametrize("size", [1.0, 1e6, 1e12, 1e18])
+def test_a_translation_of_any_size_balances_no_load(size, tol):
+    """A chain of springs without support, pulled at one end, has no equilibrium."""
+    P = np.diag([1.0, 2, 2, 1]) - np.eye(4, k=1) - np.eye(4, k=-1)
+    qp, s = qp_of(P, [-1, 0, 0, 0]), at(np.full(4, size))
+
+    assert verdict(Status.SOLVED, kkt_residuals(qp, s), tol) is not Verdict.VERIFIED
+
+
 @pytest.mark.parametrize(
     ("data", "s"),
     [
