@@ -133,12 +133,12 @@ def family_name(text: str, families: Mapping[str, Family]) -> str:
         )
     head = re.split("[:/]", text, maxsplit=1)[0]
     if head not in families:
-        readers = [
-            (f.path_suffix, name)
-            for name, f in families.items()
-            if f.path_suffix is not None and text.endswith(f.path_suffix)
-        ]
-        if readers and os.path.isfile(text):
+        if os.path.isfile(text):
+            readers = [
+                (f.path_suffix, name)
+                for name, f in families.items()
+                if f.path_suffix is not None and text.endswith(f.path_suffix)
+            ]
             named = f"{max(readers)[1]}:{text}"
             raise InputError(
                 f"unknown family {shown(head)}; did you mean {shown(named)}, a file?"

@@ -129,7 +129,7 @@ def test_an_extended_suite_measures_only_missing_results(campaign):
     old = {(r.solver, r.case) for r in records if r.session == first}
     assert {s for s, _ in old} == {"exact", "lax"}
     assert sum(r.session == second for r in records) == 36 - 8
-    assert "depth = [1, 2, 3]" in (campaign / "grown/suite.toml").read_text()
+    assert '"depth" = [1, 2, 3]' in (campaign / "grown/suite.toml").read_text()
     again = mb.run(
         campaign / "grown.toml", out=campaign / "grown", plugins=[TOY_PROBLEM]
     )
