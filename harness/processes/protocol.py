@@ -8,9 +8,9 @@ more events. The worker ends when the pipe of requests is closed.
 * Every other request is answered by ``{"event": "start"}``, at which the parent starts
   its clock, and by ``{"event": "done", …}`` with the answer. In a measurement, the
   worker sends ``{"event": "solved"}`` between these two events after the first solve,
-  and ``{"event": "timed"}`` after the last one, when its own clock has stopped. If MPI
-  ranks build the QP of a case, rank 0 sends ``{"event": "built", …}`` before "start",
-  and ``{"event": "measured"}`` before the ranks evaluate the answer.
+  and ``{"event": "timed"}`` after the last one, when its own clock has stopped. If the
+  worker builds the QP of a case itself, it sends ``{"event": "built", …}`` before
+  "start", and ``{"event": "measured"}`` before it evaluates the answer.
 * ``{"event": "fault", "what": …}`` is sent instead of the next event if code of the
   harness fails.
 

@@ -130,7 +130,7 @@ class WorkerProcess:
             self._all.add(self)
 
     def judge(self) -> WorkerProcess:
-        """Return a new worker that has no solver and only judges on ranks."""
+        """Return a new worker that has no solver and only judges answers."""
         *start, request = self._command
         command = [*start, json.dumps({**json.loads(request), "judges": True})]
         return WorkerProcess(command, self._log.with_suffix(".judge"))
@@ -176,7 +176,7 @@ class WorkerProcess:
             except OSError as e:  # a process, pipe or log could not be created
                 self._kill()
                 return Reply(fault=True, message=one_line(str(e)))
-        # the ranks of a sequence remain between its steps
+        # the processes of a sequence remain between its steps
         keeps_ranks = "step" in request and "case" in request
         is_busy = self._is_busy()
         # processes that still run would disturb the next measurement

@@ -23,7 +23,7 @@ class Commands:
     #: commands that run `harness.processes.worker`, by label of the solver
     solvers: Mapping[str, list[str]]
     case_worker: list[str]  #: command that builds and evaluates cases
-    #: True if no plug-in is loaded; otherwise, the ranks that ran its code do not judge
+    #: True if no plug-in is loaded; otherwise, processes that ran its code do not judge
     own_code_only: bool = False
 
 
