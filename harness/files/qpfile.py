@@ -254,7 +254,9 @@ def qp_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[QP, dict[str, Any]]:
             raise unknown("array", name, (*VECTORS, *_MATRICES))
     parts: dict[str, Any] = {name: stored_matrix(arrays, name) for name in _MATRICES}
     parts |= {name: _vector(arrays, name) for name in VECTORS if name in arrays}
-    dense = set(meta.get("dense", _MATRICES))
+    dense = meta.get("dense", [*_MATRICES])
+    if not isinstance(dense, list) or not all(isinstance(n, str) for n in dense):
+        raise ValueError("meta: dense is not a list of names")
     for name in _MATRICES:
         M = parts[name]
         if issparse(M) and "dense" in meta and name in dense:

@@ -33,9 +33,8 @@ from mortarbench.harness.files.npz import arrays_in
 from mortarbench.harness.files.reading import MIB, VARIABLE, max_bytes
 
 _CPU_SECONDS = 60  #: CPU time after which the kernel kills the process
-_ROOM = (
-    2**29
-)  #: address space in addition to a multiple of the largest size of the data
+#: address space in addition to a multiple of the largest size of the data
+_ROOM = 2**29
 _TOO_LARGE = 3  #: exit code if the data exceed the limit
 _PARTS = ("data", "indices", "indptr", "shape")  # of a sparse matrix in an npz file
 

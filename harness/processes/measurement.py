@@ -181,9 +181,8 @@ def _cost(reply: Reply) -> tuple[dict[str, Any], list[str]]:
         )
     if cost.get("remembered"):
         notes.append(REMEMBERED_NOTE)
-    if (
-        reply.built is not None
-    ):  # the worker measures only the memory of its own process
+    # the worker measures only the memory of its own process
+    if reply.built is not None:
         cost["peak_mib"] = reply.peak_mib
     return cost, notes
 

@@ -308,7 +308,7 @@ def text(value):
         declared("constant is not a finite", {"meta": text({"scale": 10**400})}),
         declared("constant is not a finite", {"meta": text('{"scale": NaN}')}),
         declared("Exceeds the limit", {"meta": text('{"scale": 1' + "0" * 5000 + "}")}),
-        declared("unhashable type", {"meta": text({"dense": [["P"]]})}),
+        declared("dense is not a list", {"meta": text({"dense": [["P"]]})}),
         declared("A, dense and 1099511627776 × 6, would take", {
             "A_shape": np.array([2**40, 6]), "meta": text({"dense": ["A"]})}),
     ],
