@@ -1,5 +1,4 @@
-# Products with sparse rows G, such as the rows for the rigid motions of subdomains, and
-# solves with the factor L of GGᵀ.
+# Sparse rows G, such as those for the rigid motions of subdomains, and the factor of GGᵀ.
 
 
 @cython.final

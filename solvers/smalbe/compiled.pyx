@@ -4,8 +4,7 @@
 
 A single loop, written in terms of a few operations, solves all problems. The
 operations run without Python if P is a matrix or a compiled linear map
-(`mortarbench.harness.distributed.sparse`). All other operators and preconditioners call
-Python functions; the rest of the loop stays compiled.
+(`mortarbench.harness.distributed.sparse`).
 
 * operations.pxi: products with F, products with orthonormal rows
 * coarse.pxi: sparse rows and the factor of GGᵀ
@@ -13,37 +12,28 @@ Python functions; the rest of the loop stays compiled.
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
 * incomplete.pxi: incomplete Cholesky factors of the free block of a sparse P
+* approximate.pxi: sparse approximate inverses of the free block of a dense P
 * stopping.pxi: the relative KKT residuals of the stopping test
 * mprgp.pxi: the inner loop
 * release.pxi: proportioning in the inner loop with an incomplete factor
 * outer.pxi: the outer loop and the recovery of x and its multipliers
 
-textbook.py contains the published algorithms in NumPy. Tests check that both solvers
-reach the same points and multipliers.
+textbook.py contains the published algorithms in NumPy.
 
-P is dense (one triangle is read), sparse, a compiled linear map, or an operator called
-through Python. A sparse P with few nonzero diagonals, such as a difference or finite
-element matrix on a grid, is stored by diagonals. Products then process neighbouring
-rows at the same time, and read only half of the entries because P is symmetric.
-The loops over vectors are in `vectors.h`.
+P is dense, sparse, a compiled linear map, or an operator called through Python. A sparse
+P with few nonzero diagonals, such as a matrix on a grid, is stored by diagonals.
 """
 
 cimport cython
 cimport numpy as cnp
 from cpython.exc cimport PyErr_CheckSignals
-from libc.math cimport (
-    INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
-)
+from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 from libc.stdlib cimport calloc, free as release_memory, realloc
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dsymv
-from scipy.linalg.cython_lapack cimport (
-    dgeqp3, dorgqr, dpotrf, dpotrs, dstev,
-)
+from scipy.linalg.cython_lapack cimport dgeqp3, dorgqr, dpotrf, dpotrs, dstev
 
-from mortarbench.harness.distributed.sparse cimport (
-    BorderedFactor, CompressedRows, LinearMap,
-)
+from mortarbench.harness.distributed.sparse cimport BorderedFactor, CompressedRows, LinearMap
 
 import numpy as np
 from scipy.sparse import csr_array, issparse
@@ -123,12 +113,25 @@ cdef extern from "incomplete.h" nogil:
                                 double shift, double least)
     void solve_incompletely(const incomplete *F, double s, const double *v, double *z)
 
+cdef extern from "approximate.h" nogil:
+    int NEIGHBOURS
+    ctypedef struct sparse_row:
+        int count
+        int *column
+    void find_row(const double *F, const double *w, Py_ssize_t n, int i,
+                  double *strength, sparse_row *row)
+    void approximate_inverse(const sparse_row *G, const double *v, double *y,
+                             Py_ssize_t n)
+    double coupling(const double *F, const double *w, Py_ssize_t n,
+                    const sparse_row *G, double *t)
+
 include "operations.pxi"
 include "coarse.pxi"
 include "preparation.pxi"
 include "feasible_set.pxi"
 include "model.pxi"
 include "incomplete.pxi"
+include "approximate.pxi"
 include "stopping.pxi"
 include "mprgp.pxi"
 include "release.pxi"

@@ -173,7 +173,7 @@ def _on_discs(qp: QP, options: Options) -> Options:
         options,
         rho=options.rho or RHO_ON_DISCS,
         expansion="spectral",
-        preconditioner="none" if kind == "model" else kind,
+        preconditioner="none" if kind in ("model", "sparse") else kind,
     )
 
 
@@ -232,12 +232,9 @@ def _lanczos_steps(options: Options, qp: QP) -> int:
     the spectrum, so that more steps are worthwhile: with n/10 instead of n/6 steps, the
     24 problems of greco/n=32/dual-bounds take 170 products instead of 152.
     """
+    few = qp.q.size // (6 if qp.b.size else 10)
     if preconditioned_operator(qp) or options.expansion == "spectral":
         few = 0
-    elif qp.b.size:
-        few = qp.q.size // 6
-    else:
-        few = qp.q.size // 10
     return min(options.lanczos_steps, max(MIN_LANCZOS_STEPS, few))
 
 
@@ -314,7 +311,10 @@ def outer_loop(
     else:
         own = options.preconditioner_for(qp)
         kind = resolved_preconditioner(qp, options.preconditioner)
-        M = structural_preconditioner(qp, kind) if own is None else checked(own)
+        if own is None:
+            M = structural_preconditioner(qp, kind, problem.F)
+        else:
+            M = checked(own)
         rule = options.step_rule_for(qp)
         solver = compiled.SMALBE(problem, options, kind != "none", M, rule)
     watch = (

@@ -1,5 +1,4 @@
-# The feasible set and all its operations that MPRGP uses. The loop of MPRGP does not
-# depend on the type of the set.
+# The feasible set, on whose type the loop of MPRGP does not depend.
 
 
 # Relative rounding of the distance from the centre of a disc, after sixteen operations.
@@ -26,10 +25,9 @@ cdef struct Parts:
 cdef class FeasibleSet:
     """The box l ≤ x ≤ u, and discs ‖x_I + c_I‖ ≤ r over variables without bounds.
 
-    Either all variables of a disc are free, or all of them are active. A disc is active
-    if the distance of x to its boundary is at most `slack`. The chopped gradient β on
-    an active disc is the gradient g, but if nᵀg < 0 with the outward normal n, the
-    normal component of g is subtracted. On a disc of radius zero, φ = β = 0.
+    A disc is active, with all its variables, if the distance of x to its boundary is at
+    most `slack`. There, β = g, but if nᵀg < 0 with the outward normal n, the normal
+    component is subtracted. On a disc of radius zero, φ = β = 0.
     """
 
     cdef Py_ssize_t n, n_discs

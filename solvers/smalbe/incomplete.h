@@ -2,13 +2,10 @@
 
    M = (I + L) D (I + L)' where L has the pattern of P. Fill-in outside this pattern is
    dropped, and `keep` times each dropped entry is added to the diagonal entries of its
-   row and column. For keep = 1, this preserves row sums (modified incomplete Cholesky,
-   Gustafsson 1978); keep = 0 is the method of Meijerink and van der Vorst (1977). Benzi
-   (2002) surveys these methods.
-
-   Only free components are included. If P has few diagonals, L is stored by
-   diagonals. Only the entries next to the main diagonal then form a recurrence, and
-   all other entries are subtracted for a few hundred rows at the same time. */
+   row and column (keep = 0: Meijerink and van der Vorst 1977). Only free components are
+   included. If P has few diagonals, L is stored by diagonals: only entries next to the
+   main diagonal then form a recurrence, and all others are subtracted for a few hundred
+   rows at the same time. */
 
 #ifndef INCOMPLETE_H
 #define INCOMPLETE_H

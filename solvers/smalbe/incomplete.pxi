@@ -2,19 +2,15 @@
 
 
 # Fraction of each dropped entry that is added to the diagonal. With 1, a few pivots are
-# small and CG is slow on irregular faces: torsion with n = 100 takes 97 products instead
-# of 54. With 0.95, 24 other strings, bearings, torsions and obstacles take 1.12 times as
-# many products in the geometric mean, and journal bearings twice as many with 0.
+# small and CG is slow on irregular faces.
 cdef double KEEP = 0.99
 
 # Smallest pivot, relative to the diagonal entry. The relative rounding error of entries
 # is 2⁻⁵², so larger pivots have about six correct digits or more.
 cdef double LEAST_PIVOT = 1e-10
 
-# If a pivot is too small although no dropped entries are added to the diagonal, the
-# diagonal is shifted (Manteuffel 1980). The first relative shift is FIRST_SHIFT, and it
-# is multiplied by SHIFT_GROWTH until no pivot is too small. The pivots of a diagonally
-# dominant matrix are large enough.
+# First relative shift of the diagonal (Manteuffel 1980) if a pivot is too small although
+# no dropped entries are added, and its growth until no pivot is too small
 cdef double FIRST_SHIFT = 1e-3
 cdef double SHIFT_GROWTH = 4.0
 
@@ -61,16 +57,11 @@ cdef class IncompleteFactor:
 
     L has the sparsity pattern of P. Dropped entries, multiplied by `keep`, which is
     KEEP or 0, are added to the diagonal (modified incomplete Cholesky, Gustafsson, BIT
-    18, 1978, 142-156; see also Benzi's survey, J. Comput. Phys. 182, 2002, 418-477).
-    For a tridiagonal matrix, no entry is dropped, and M = P_FF. If a pivot is below
-    LEAST_PIVOT times the diagonal entry, `keep` is set to 0. If this is not sufficient,
-    the diagonal is multiplied by 1 + σ with increasing σ (Manteuffel, Math. Comp. 34,
-    1980, 473-497). M is therefore finite and positive definite for every symmetric P
-    with a positive diagonal. The final values of `keep` and σ are used for all later
-    faces.
-
-    With `keep` = 1, the row sums of P would be preserved. Therefore P should map the
-    vector of ones to zero in the interior of a domain.
+    18, 1978, 142-156), which with `keep` = 1 would preserve the row sums of P. If a
+    pivot is below LEAST_PIVOT times the diagonal entry, `keep` is set to 0. If this is
+    not sufficient, the diagonal is multiplied by 1 + σ with increasing σ (Manteuffel,
+    Math. Comp. 34, 1980, 473-497). M is therefore finite and positive definite for every
+    symmetric P with a positive diagonal. Later faces use the final values.
 
     matrix : P in SciPy's csr or csc format, with sorted indices
     scale : factor s; `inverse` applies s M⁻¹

@@ -2,11 +2,9 @@
 
 
 cdef enum:
-    # Limits of Newton's method and of its line search. The search keeps a distance of
-    # 5 % from the ends of its interval, so that 60 steps reduce the interval to at most
-    # 5 %. If Newton's method does not end, the step is computed with the model norm·I,
-    # where norm is the largest eigenvalue of B. Without the line search,
-    # `test_friction_takes_fewer_products_than_published_rules` fails.
+    # Limits of Newton's method and of its line search, which keeps a distance of 5 % from
+    # the ends of its interval. If Newton's method does not end, the step is computed with
+    # the model norm·I, where norm is the largest eigenvalue of B.
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
 
@@ -16,12 +14,10 @@ cdef class Model:
     """B = τI + Uᵀ diag(w) U with an orthonormal basis U (k, n).
 
     The rows of U are the directions in which H is large, with eigenvalues w + τ, and τ
-    bounds H on the complement of these directions. If B ≥ H, then f(x + s) ≤ f(x) + gᵀs
-    + ½sᵀBs, and the minimiser of the right-hand side over the set is a gradient
-    projection step in the metric of B. Without U, this step is the ordinary step x ←
-    Π(x − g/τ), whose length is determined by ‖H‖. With U, the remaining spectrum
-    determines the length. Each step takes a product with H, which shows whether B ≥ H
-    along the step; if not, τ is increased.
+    bounds H on their complement. If B ≥ H, then f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the
+    minimiser of the right-hand side over the set is a gradient projection step in the
+    metric of B. Without U, this is the ordinary step x ← Π(x − g/τ). Each step takes a
+    product with H, which shows whether B ≥ H along the step; if not, τ is increased.
     """
 
     cdef double tau
@@ -59,10 +55,9 @@ cdef class Model:
         """s ← argmin of gᵀs + ½sᵀBs over all s with x + s in the set.
 
         For a multiplier y, s(y) minimises (g + Uᵀy)ᵀs + τ/2‖s‖² over the set. The
-        solution has the multiplier y = WUs, which maximises the dual function. This
-        function of k variables is concave and piecewise quadratic, with the gradient
-        Us(y) − W⁻¹y. Newton's method with a line search ends on the quadratic piece
-        that contains the maximum.
+        solution has the y = WUs that maximises the dual function, which is concave and
+        piecewise quadratic with the gradient Us(y) − W⁻¹y. Newton's method with a line
+        search ends on the piece that contains the maximum.
         """
         cdef Basis U = self.basis
         cdef Py_ssize_t i, newton, search, k = self.k

@@ -1,69 +1,42 @@
 # MPRGP, independent of the type of the feasible set.
 
 
-# Rounding of a cost, relative to the sum of its absolute terms. The error of a sum of k
-# terms grows like √k·2⁻⁵³, so this value suffices for 8·10⁵ terms. With zero,
-# `test_a_solve_stalled_by_rounding_ends` takes 4000 products instead of 1000.
+# Rounding of a sum of up to 8·10⁵ terms, √k·2⁻⁵³, relative to their absolute values. With
+# zero, `test_a_solve_stalled_by_rounding_ends` takes 4000 products instead of 1000.
 cdef double NOISE = 1e-13
 
-# Smallest accepted ratio of gᵀp to φᵀz, where the CG direction p is the component of
-# the preconditioned gradient z that is conjugate to the earlier directions. In exact
-# arithmetic, both products are equal, because g is orthogonal to all earlier
-# directions. A smaller ratio shows that rounding has reintroduced components of g along
-# these directions. Without this limit,
+# Smallest accepted ratio of gᵀp to φᵀz, which are equal in exact arithmetic, because g is
+# orthogonal to all earlier directions. A smaller ratio shows that rounding has
+# reintroduced components of g along them. Without this limit,
 # `test_rounding_along_previous_directions_is_removed` fails.
 cdef double MIN_SLOPE_RATIO = 0.5
-# For a semidefinite F, as with redundant rows, CG is *spent* on a face if φᵀz exceeds
-# its smallest value by this factor. In exact arithmetic, the condition number of MF on
-# the range of F limits this growth, so such directions are rounding errors. They
-# approach the kernel of F, and x would grow without limit
-# (`test_a_semidefinite_dual_ends_at_its_rounding_errors`).
+# For a semidefinite F, CG is *spent* on a face if φᵀz exceeds its smallest value by this
+# factor. Such directions are rounding errors near the kernel of F, along which x would
+# grow without limit (`test_a_semidefinite_dual_ends_at_its_rounding_errors`).
 cdef double MAX_GROWTH = 1e6
 
 cdef enum:
     # Largest number of CG directions stored for a face. Two passes over 200 directions
-    # read 400 vectors, as many numbers as a product with the triangle of a dense F of
-    # 800 unknowns. With 3 directions,
-    # `test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns` fails.
+    # read as many numbers as a product with the triangle of a dense F of 800 unknowns.
     MAX_DIRECTIONS = 200
-    # Number of consecutive proportioning steps by the model that may fail to halve ‖β‖²
-    # before a step along −β is taken. Without this limit,
-    # `test_a_poor_model_is_replaced` fails.
-    MAX_IDLE = 2
-    # Number of steps before the first check for stagnation, ten times the number of
-    # steps for a preconditioned dual. Without the check,
-    # `test_a_solve_stalled_by_rounding_ends` fails.
+    # Number of steps before the first check for stagnation, ten times the number for a
+    # preconditioned dual. Without it, `test_a_solve_stalled_by_rounding_ends` fails.
     FIRST_CHECK = 500
     MODEL = 0
     SPECTRAL = 1
     OWN = 2
-    # Number of previous costs with which the nonmonotone line search compares. In a
-    # prototype, Mindlin's problem with 88 to 1468 discs takes as many products with 10
-    # and with 40 as with 20, 2 % more with 5, and 35 % more with 1 (a monotone search).
-    # With 10 428 discs, it takes 12 % more products with 10.
+    # Number of previous costs with which the nonmonotone line search compares. A first
+    # Newton step is taken after as many steps, or after √n if this is larger.
     MEMORY = 20
-    # Number of steps before the first Newton step, about the number of products of a
-    # Newton step on the contact patches mentioned above. With 10, Mindlin's problem
-    # with 1468 discs takes up to 40 % more products. With n unknowns, the number is √n
-    # if this is larger than 100. Mindlin's problem, ν = 0.3, then takes 57, 148 and 344
-    # products with 1468, 41 684 and 166 740 discs. With 100 steps in all three cases,
-    # an earlier version took 61, 217 and 444 products, and five times the memory.
-    FIRST_NEWTON = 100
 
 
-# Fraction of the linear decrease that a spectral step must achieve (Armijo condition).
+# Fraction of the linear decrease that a spectral step must achieve (Armijo condition)
 cdef double SUFFICIENT_DECREASE = 1e-4
 
 
-# Relative accuracy of conjugate gradients in a Newton step. With 0.1, the contact
-# patches take up to 1.7 times as many products.
-cdef double NEWTON_ACCURACY = 0.01
-
-# Smallest penalty of the model in a structural preconditioner if there are discs. The
-# inverse of this model must be nearly the projector onto the kernel of the rows; with ρ
-# = 1, the default with discs, it would be the identity. With 1, contact-patch/dim=3 in
-# subdomains with ratio=100 and distort=0.25 takes 7692 products instead of 575. Values
-# from 1e2 to 1e6 lead to similar numbers of products.
+# Smallest penalty of the model in a structural preconditioner if there are discs, with
+# which its inverse is nearly the projector onto the kernel of the rows. With ρ = 1, the
+# default with discs, a contact patch in subdomains takes 7692 products instead of 575.
 cdef double MIN_PROJECTING = 1e4
 
 # Factor of Γ² for spectral steps, which act on φ and β at the same time
@@ -86,11 +59,10 @@ cdef double *enlarged(double *array, Py_ssize_t size) except NULL:
 cdef class Directions:
     """The latest conjugate directions of CG on a face, scaled to pᵢᵀHpⱼ = δᵢⱼ.
 
-    In exact arithmetic, conjugacy to the last direction implies conjugacy to all k
-    directions. Rounding destroys this property after a few dozen steps. A change of the
-    right-hand side on the same face (in a multiplier step) destroys it immediately.
-    Explicit conjugation to all directions costs two passes over k vectors per step
-    (Farhat, Crivelli and Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, 195-209).
+    Rounding destroys the conjugacy to earlier directions after a few dozen steps; a new
+    right-hand side (a multiplier step) or preconditioner destroys it immediately.
+    Explicit conjugation costs two passes over all directions per step (Farhat, Crivelli
+    and Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, 195-209).
 
     free : (n,) mask of the face, 1 for components off the boundary, else 0
     """
@@ -161,10 +133,10 @@ cdef class MPRGP:
     """Modified proportioning with reduced gradient projections.
 
     The method minimises ½xᵀHx − bᵀx over a set (Dostál 2009, the paper's reference [3],
-    Chapter 5; Dostál and Schöberl 2005), with H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ. Let g = Hx − b be the
-    gradient. The free gradient φ equals g for components off the boundary. The chopped
-    gradient β is the part of g on the boundary for which −β is a feasible direction.
-    The projected gradient is g^P = φ + β. Each step is one of the following:
+    Chapter 5; Dostál and Schöberl 2005), with H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ and g = Hx − b. The free
+    gradient φ equals g for components off the boundary, the chopped gradient β is the
+    part of g on the boundary for which −β is a feasible direction, and g^P = φ + β is
+    the projected gradient. Each step is one of the following:
 
     * c, conjugate gradient: minimise along p on the face if the step is feasible; p is
       conjugate to all stored `Directions` of the face, not only to the last direction
@@ -179,20 +151,14 @@ cdef class MPRGP:
     A proportioning step is taken if  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient
     φ̃, defined by x − φ̃/τ = Π(x − φ/τ) with the projection Π onto the set.
 
-    Over discs, *spectral steps* x ← x + t(Π(x − αg) − x) with the length of Barzilai and
-    Borwein and the nonmonotone line search of Birgin, Martínez and Raydan (SIAM J.
-    Optim. 10, 2000, Algorithm 2.2) replace expansions and proportioning. CG begins on a
-    face only if a step of length α along −φ stays in the set. On a face that no longer
-    changes, *Newton steps* x ← Π(x − d) follow, where CG solves T(H + κ)Td = Tg with
-    the projector T onto the tangents of the boundary and its curvature κ times the
-    multiplier.
+    Over discs, *spectral steps* x ← x + t(Π(x − αg) − x) (Birgin, Martínez and Raydan,
+    SIAM J. Optim. 10, 2000, Algorithm 2.2) replace expansions and proportioning. CG
+    begins on a face only if a step of length α along −φ stays in the set. On a face that
+    no longer changes, *Newton steps* x ← Π(x − d) follow, where CG solves T(H + κ)Td = Tg
+    with the projector T onto the tangents and the curvature κ times the multiplier.
 
-    Every step decreases the cost, except spectral steps. With the
-    model τI, the decrease is at least the amount on which the rate of convergence in
-    the book is based. An expansion does not release components that its half step moved
-    to the boundary, except the first expansion by a model with directions. Apart from
-    this exception, and from spectral and Newton steps, the active set therefore only
-    grows between proportioning steps. docs/smalbe.md discusses the consequences.
+    Every step decreases the cost, except spectral steps. docs/smalbe.md states the
+    guarantees.
     """
 
     cdef Product F
@@ -203,7 +169,7 @@ cdef class MPRGP:
     cdef FeasibleSet set
     cdef FeasibleSet face_set  # feasible set of the step that follows a half step
     cdef double inverse_norm, rho
-    cdef double alpha, Gamma_square
+    cdef double alpha, Gamma_square, eta
     cdef int expansion
     cdef Room room  # memory of all vectors
     cdef double *rhs  # b of the inner problem
@@ -238,6 +204,8 @@ cdef class MPRGP:
     cdef Model preconditioner
     cdef object M  # product v → Mv with a structural preconditioner, or None
     cdef LinearMap M_map  # M as a compiled linear map, or None
+    cdef ApproximateInverse inverse  # M of a dense P, or None
+    cdef bint uses_M  # false for the first CG step on a face with `inverse`
     cdef double M_scale  # ‖𝒫F𝒫‖, because M approximates F⁻¹ rather than H⁻¹
     cdef object counts  # counts of applications of M
     # step rule of a subclass (`solvers.smalbe.extension`), or None
@@ -279,19 +247,19 @@ cdef class MPRGP:
         The run returns False after `most` steps, if no step is possible or CG is spent
         and a recomputed gradient is no better (`refresh`), or if the run *stagnates*:
         since the previous check, the smallest ‖g^P‖ was not halved and the cost
-        decreased by no more than the rounding of its terms. The first check is made
-        after `FIRST_CHECK` steps, and each further check after twice as many steps.
+        decreased by no more than the rounding of its terms. Checks are made after
+        `FIRST_CHECK` steps, and then each time after twice as many.
 
         trace : receives the letters of the steps
         note : function called with the letter, x and g after each step, or None
         """
-        cdef long idle = 0, inside = 0  # number of CG steps on this face
+        cdef long inside = 0  # number of CG steps on this face
         cdef long check = FIRST_CHECK
         cdef double least = INFINITY, before = INFINITY, cost = INFINITY  # at the last check
         cdef double now
         cdef int letter
         cdef bint has_expanded = False, begun = True
-        cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
+        cdef double chopped = INFINITY, last  # ‖β‖² at the last two proportionings
         cdef double began
         self.cost_now, self.n_costs = 0.0, 0
         self.record_cost(0.0)
@@ -327,9 +295,10 @@ cdef class MPRGP:
             if self.parts.beta_square > self.Gamma_square * self.parts.reduced_square:
                 # Step 4. Proportioning, because releasing components promises a larger
                 # decrease than a step on the face.
-                idle = idle + 1 if self.parts.beta_square > chopped / 2 else 0
-                chopped = self.parts.beta_square
-                letter = self.proportion(idle < MAX_IDLE or self.B.basis is None)
+                last, chopped = chopped, self.parts.beta_square
+                letter = self.proportion(
+                    2 * chopped <= last or self.B.basis is None
+                )
             elif not inside and self.spectral_step_leaves(begun):
                 letter = b"e" if self.step_spectrally() else 0
             else:
@@ -378,9 +347,8 @@ cdef class MPRGP:
     cdef int refresh(self) except -1:
         """Recompute the gradient from x and restart CG.
 
-        Updates of the gradient retain rounding errors of its first, large values. The
-        function takes one product. It returns 0, without a restart, if ‖φ‖ has not been
-        halved since the last call.
+        The function takes one product. It returns 0, without a restart, if ‖φ‖ has not
+        been halved since the last call.
         """
         self.gradient(self.x, self.g)
         self.split()
@@ -425,6 +393,7 @@ cdef class MPRGP:
     cdef int first_direction(self) except -1:
         """Prepare the preconditioner for the face and set p to z."""
         self.least_slope = INFINITY
+        self.uses_M = self.M is not None and self.inverse is None
         if self.factor is not None:
             self.factor.enter(self.free, True)
         elif self.is_preconditioned():
@@ -436,29 +405,35 @@ cdef class MPRGP:
         """Return z, the preconditioned φ on the face.
 
         With P = B_FF⁻¹ of the model alone, z = Pφ. With a matrix M that approximates
-        F⁻¹ without ρQ, z = P(‖𝒫F𝒫‖ M − I)Pφ + Pφ (`solvers.smalbe.preconditioner`).
-        With discs, ρ is small, and P belongs to the penalty MIN_PROJECTING instead.
-        Then (φ − Pφ)/ρ is added for the complement of the range of P, where ρQ
-        dominates H.
+        F⁻¹ without ρQ, z = P(τ²‖𝒫F𝒫‖ M − τI)Pφ + Pφ (`solvers.smalbe.preconditioner`), or
+        z = Mφ for an `ApproximateInverse` without rows. With discs, P belongs to the
+        penalty MIN_PROJECTING, and (φ − Pφ)/ρ is added off its range.
         """
         cdef Py_ssize_t i, n = self.n
         cdef double *rest = self.t
         cdef double *Mz = self.s
-        cdef double weight = 1 / self.rho
+        cdef double weight = 1 / self.rho, tau
         if not self.is_preconditioned():
             return self.phi
         if self.factor is not None:
             self.factor.inverse(self.phi, self.z)
             return self.z
-        self.preconditioner.inverse(self.free, self.phi, self.z)
-        if self.M is not None:
+        if self.uses_M:
             self.counts["preconditioner_applies"] += 1
-            if self.M_map is not None:
+        if self.uses_M and self.inverse is not None and not self.rows.exist:
+            approximate_inverse(self.inverse.G, self.phi, self.z, n)
+            return self.z
+        tau = self.preconditioner.tau
+        self.preconditioner.inverse(self.free, self.phi, self.z)
+        if self.uses_M:
+            if self.inverse is not None:
+                approximate_inverse(self.inverse.G, self.z, Mz, n)
+            elif self.M_map is not None:
                 self.M_map.apply(self.z, Mz, 1)
             else:
                 copy_result(self.M(view(self.z, n)), n, Mz, "M @ v")
             for i in range(n):
-                rest[i] = self.free[i] * (self.M_scale * Mz[i] - self.z[i])
+                rest[i] = self.free[i] * tau * (tau * self.M_scale * Mz[i] - self.z[i])
             if self.rows.exist and self.penalty_of_M() > self.rho:
                 scale(1 - weight, self.z, n)
                 add(weight, self.phi, self.z, n)
@@ -497,10 +472,9 @@ cdef class MPRGP:
     cdef int step_by_model(self) except -1:
         """Minimise the model over the set, then the cost along that step.
 
-        The function returns 0 if the step is zero or the cost is unbounded along the
-        step. If B ≥ H, the minimising length is at least 1. If the product shows that B
-        ≥ H is violated, τ is increased. The line search decreases the cost in both
-        cases.
+        The function returns 0 if the step is zero or the cost is unbounded along it. If
+        the product shows that B ≥ H is violated (the minimising length is below 1), τ is
+        increased.
         """
         cdef double length
         if self.set.has_discs:  # any other length would leave a curved boundary
@@ -518,9 +492,8 @@ cdef class MPRGP:
     cdef double searched(self, double *s, double *Hs) except? -1:
         """Return the α that minimises the cost along x + αs, at most max(1, α_f).
 
-        The length is 0 for s = 0, and inf if the cost is unbounded. The function
-        replaces s by −s, so that the step is x − αs, and stores the `lengths` of this
-        step in `line`. It takes one product.
+        The length is 0 for s = 0, and inf if the cost is unbounded. The function takes
+        one product, replaces s by −s, and stores the `lengths` of x − αs in `line`.
         """
         if not dot(s, s, self.n):
             return 0
@@ -551,11 +524,7 @@ cdef class MPRGP:
         )
 
     cdef int step_spectrally(self) except -1:
-        """Take a spectral step, with one product; return 0 if the step is zero.
-
-        Because the cost is quadratic along the step, one product suffices for the line
-        search and for the next α.
-        """
+        """Take a spectral step, with one product; return 0 if the step is zero."""
         cdef Py_ssize_t i
         cdef double length, most = self.cost_now
         cdef double tau = 1 / self.spectral_length if self.spectral_length else self.B.tau
@@ -580,8 +549,7 @@ cdef class MPRGP:
 
         If this step does not decrease the cost, x is unchanged and the result is False.
         If the step does not halve the projected gradient, the next Newton step is taken
-        only after as many other steps as this step took products. Useless Newton steps
-        therefore take no more than about half of all products.
+        only after as many other steps as this step took products.
 
         most : largest number of letters in `trace`, which receives one letter per CG
             step
@@ -603,7 +571,7 @@ cdef class MPRGP:
         memcpy(self.phi, self.g, n * sizeof(double))
         self.set.follow(self.x, self.g, NULL, self.phi)
         square = dot(self.phi, self.phi, n)
-        enough = NEWTON_ACCURACY * NEWTON_ACCURACY * square
+        enough = self.eta**4 * square  # CG to the relative accuracy η²
         while square > enough and len(trace) < most and steps < n:
             z = self.preconditioned_gradient()
             memcpy(self.p, z, n * sizeof(double))
@@ -640,9 +608,9 @@ cdef class MPRGP:
     cdef double searched_projection(self, double tau, double rise) except? -1:
         """Return the length of the step along −s = Π(x − g/τ) − x, or 0 if s = 0.
 
-        The length is 1 if the resulting cost is sufficiently below the present cost
-        plus `rise`, otherwise the minimising length. The function takes one product. It
-        stores s, Hs, slope and curvature, and the length α of the next spectral step.
+        The length is 1 if the cost then falls sufficiently below the present one plus
+        `rise`, otherwise the minimising length. The function takes one product, and also
+        stores the length α of the next spectral step.
         """
         cdef double square
         cdef Line *line = &self.line
@@ -698,11 +666,8 @@ cdef class MPRGP:
         """Take the CG step along `line` and compute the next direction.
 
         If rounding has reintroduced components of the gradient along earlier
-        directions, the cost is again minimised along all earlier directions, without a
-        product. This minimisation is repeated only if ‖φ‖ has been halved since the
-        last one, because it would otherwise be repeated endlessly when only rounding
-        errors remain.
-
+        directions, the cost is again minimised along all of them, without a product,
+        provided that ‖φ‖ has been halved since the last such minimisation.
         """
         cdef double length = self.line.cg, curvature = self.line.curvature
         cdef const double *z
@@ -728,6 +693,8 @@ cdef class MPRGP:
         # `Cv` contains Cp, which the product Hp has stored
         add(-length, self.Cv, self.Cx, self.rows.r)
         self.knows_Cx = knows_Cx
+        if self.inverse is not None and not self.uses_M and self.inverse.is_accurate:
+            self.uses_M = self.inverse.enter(self.free)
         z = self.preconditioned_gradient()
         if self.directions.count:  # p is one of the stored directions
             memcpy(self.p, z, self.n * sizeof(double))
@@ -789,8 +756,8 @@ cdef class MPRGP:
     cdef int trial_of_rule(self, double *y) except -1:
         """y ← Π(x_trial − x̃) with the trial point x_trial of a subclass's step rule.
 
-        The rule receives x = x̃ + ν. It also receives the gradient and lengths of the
-        augmented Lagrangian of the original QP, without the factor 1/‖𝒫F𝒫‖ of H.
+        The rule receives x = x̃ + ν, and the gradient and lengths of the augmented
+        Lagrangian of the original QP, without the factor 1/‖𝒫F𝒫‖ of H.
         """
         cdef Py_ssize_t i, n = self.n
         cdef const double *shift = self.rows.x_tilde
@@ -820,23 +787,16 @@ cdef class MPRGP:
     ) except -1:
         """Project the infeasible CG point z onto the set in the metric of the model.
 
-        The CG point is z = x − α_cg p. In a flat spectrum, where a step changes the
-        active set only slightly, CG continues from z on the face without its bounds.
-        The cost at z is known. If B ≥ H, the cost near z is bounded by
-
-            f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr.
-
-        The point z + r minimises the right-hand side over the set. The tail of B is
-        divided by the relaxation factor ᾱ‖H‖, by which gradient projection steps exceed
-        1/‖H‖. Components that the half step (the step to the boundary) moves to the
-        boundary stay there. The first expansion with a model that has directions is an
-        exception, because the active set before this expansion is only a guess. Without
-        it, one random QP of 806 takes 3.3 times as many products. From
-        the half step, the method moves along the line through z + r: at least to z + r
-        if the cost there is below the cost at x, otherwise to the minimiser along the
-        line. If B = τI and the decrease is less than φ̃ᵀφ/2τ, the decrease of gradient
-        projection from x for τ ≥ ‖H‖, a gradient projection step from x is taken
-        instead.
+        The CG point is z = x − α_cg p. In a flat spectrum, CG continues from z on the
+        face without its bounds. If B ≥ H, f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr. The point
+        z + r minimises the right-hand side over the set, where the tail of B is divided
+        by the relaxation factor ᾱ‖H‖ of gradient projection. Components that the half
+        step (the step to the boundary) moves to the boundary stay there, except in the
+        first expansion with a model that has directions, because the earlier active set
+        is only a guess. From the half step, the method moves along the line through
+        z + r: at least to z + r if the cost there is below the cost at x, otherwise to
+        the minimiser along the line. If B = τI and the decrease is less than φ̃ᵀφ/2τ,
+        that of gradient projection for τ ≥ ‖H‖, such a step from x is taken instead.
         """
         cdef Py_ssize_t i, n = self.n
         cdef double *s = self.s

@@ -1,14 +1,10 @@
 # The basic operations of SMALBE: products with F, and products with orthonormal rows.
-# These operations run without Python, except products with an operator that is not
-# compiled.
 
 
 # --- numbers ------------------------------------------------------------------------
-# Creating a memoryview takes as long as a pass over a thousand numbers, and creating a
-# buffer or an array through Python takes as long as a pass over a hundred numbers. For
-# small problems, this would take more time than the products. Arrays are therefore
-# created and accessed through NumPy's C interface. The caller passes the lengths and
-# keeps a reference to each array.
+# For small problems, creating memoryviews and arrays through Python would take more time
+# than the products. Arrays are therefore created and accessed through NumPy's C
+# interface; the caller passes the lengths and keeps a reference to each array.
 
 
 @cython.final
@@ -270,9 +266,8 @@ cdef class Rows:
     cdef int fit(self, const double *free, double *r, double *a) except -1:
         """a ← the result of `fitted`.
 
-        Eigenvalues of C_F C_Fᵀ below FREE_RANK count as zero. Normal equations double
-        the number of lost digits, so that dense rows are fitted twice, the second time
-        to the residual.
+        Normal equations double the number of lost digits, so that dense rows are fitted
+        twice, the second time to the residual.
 
         free : (n,) 1 for free components, else 0
         r : (n,) argument of `fitted`, overwritten
@@ -317,9 +312,8 @@ cdef class Rows:
         return multipliers
 
 
-# If ‖x̃‖/‖ν‖ is at most this value, which is several hundred times 2⁻⁵³, e counts as
-# zero, and x̃ as its rounding error. Without this test,
-# `test_a_right_hand_side_of_rounding_size_counts_as_zero` fails.
+# If ‖x̃‖/‖ν‖ is at most this value, e counts as zero, and x̃ as its rounding error
+# (`test_a_right_hand_side_of_rounding_size_counts_as_zero`).
 cdef double SHIFT_ROUNDING = 1e-13
 # Shift of G_F G_Fᵀ, relative to GGᵀ, for multipliers fitted on a face with free
 # components F. Eigenvalues of G_F G_Fᵀ relative to GGᵀ below this value count as zero.

@@ -38,9 +38,7 @@ class Options:
     eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP: ‖β‖² > Γ²φ̃ᵀφ
     # if P is sparse, conjugation against stored directions costs more than a product
-    recycle: bool = (
-        True  #: make CG directions conjugate to all stored ones, unless P is sparse
-    )
+    recycle: bool = True  #: make CG directions conjugate to all stored ones
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     # n/10 is the limit without equality rows
     lanczos_steps: int = 12  #: limit of Lanczos steps; at most n/6 or n/10, at least 5

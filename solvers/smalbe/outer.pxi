@@ -1,19 +1,15 @@
 # The outer loop, and the recovery of x and its multipliers.
 
 
-# Largest penalty to which the safeguards of the outer loop increase ρ. At this value,
-# the rounding error 2⁻⁵³ρ‖ν‖ of ρQν reaches 1e-6·‖ν‖; with larger values, it would
-# dominate the gradient. Without a limit, models become indefinite
-# (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`). With 1e3,
-# `test_a_stalled_multiplier_increases_the_penalty` fails.
+# Largest penalty to which the safeguards of the outer loop increase ρ. The rounding error
+# 2⁻⁵³ρ‖ν‖ of ρQν is then 1e-6·‖ν‖; a larger one would dominate the gradient
+# (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`).
 cdef double MAX_RHO = 1e10
-# Smallest τ of a model, relative to the norm. Steps are therefore at most 1e4 times as
-# long as the steps of ordinary gradient projection. With zero, an F of low rank leads
-# to τ = 0, so that no step is possible (`test_earlier_failures_do_not_recur`).
+# Smallest τ of a model, relative to the norm. With zero, an F of low rank leads to τ = 0,
+# so that no step is possible (`test_earlier_failures_do_not_recur`).
 cdef double MIN_TAIL = 1e-4
 # Value of ‖g^P‖ in units of tol‖b‖ below which the inner run ends even if the KKT
-# residual exceeds the tolerance. At a KKT residual of 1e-6, ‖g^P‖/‖b‖ is 1e-4 for
-# strings and 1e-5 for journal bearings.
+# residual exceeds the tolerance
 cdef double LEAST_TESTED = 1e-2
 
 
@@ -60,6 +56,7 @@ cdef class SMALBE(MPRGP):
         self.F, self.M, self.counts = problem.F, M, problem.counts
         self.is_semidefinite = problem.semidefinite
         self.M_map = M if isinstance(M, LinearMap) else None
+        self.inverse = M if isinstance(M, ApproximateInverse) else None
         self.n = self.F.n
         self.norm = self.M_scale = spectrum.norm
         self.inverse_norm = 1 / self.norm
@@ -72,7 +69,7 @@ cdef class SMALBE(MPRGP):
             self.set.add_discs(problem.discs, self.rows.x_tilde)
         if len(problem.diagonal):
             self.diagonal = read(problem.diagonal, self.owners)
-        self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
+        self.alpha, self.Gamma_square, self.eta = options.alpha, options.Gamma**2, options.eta
         if options.expansion == "spectral":
             self.Gamma_square *= SPECTRAL_GAMMA
         self.expansion = SPECTRAL if options.expansion == "spectral" else MODEL
@@ -94,7 +91,7 @@ cdef class SMALBE(MPRGP):
         if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept)
-        self.patience = <long>fmax(FIRST_NEWTON, sqrt(self.n))
+        self.patience = <long>fmax(MEMORY, sqrt(self.n))
         self.tangents = Directions(
             self.n, MAX_DIRECTIONS if self.expansion == SPECTRAL else 0
         )
@@ -107,15 +104,12 @@ cdef class SMALBE(MPRGP):
         """Choose the directions of the models and the tail, the value of τ.
 
         The tail estimates the norm of 𝒫F𝒫 on the complement of the selected directions.
-        It is the second to last Ritz value plus its residual, or the last value plus
-        its residual if the process ended because β = 0. If the residual of an earlier
-        pair exceeds its value, the first pair with this property is used instead. If
-        the tail is too small, MPRGP increases τ to the curvature that its products
-        show. The models contain ρQ exactly. In a flat spectrum, a short Lanczos process
-        does not converge even to the first eigenvector, and Ritz vectors that are not
-        eigenvectors would slow down CG. In this case, only the norm is used. With
-        sparse rows, also only the norm is used, because sparse rows usually come from
-        many subdomains, for which the spectrum is flat.
+        It is the second to last Ritz value plus its residual, or the last one if the
+        process ended because β = 0, or the first one whose residual exceeds its value.
+        If it is too small, MPRGP increases τ to the curvature of its products. In a flat
+        spectrum, where not even the first pair converges, only the norm is used, because
+        other Ritz vectors would slow down CG; also with sparse rows, which usually come
+        from many subdomains with a flat spectrum.
         """
         cdef Py_ssize_t i, n_directions, kept = 0, n = self.n, r = self.rows.r
         cdef const double *value = NULL
@@ -177,7 +171,7 @@ cdef class SMALBE(MPRGP):
         else:
             self.B = self.model(self.rho, self.tail, True)
         self.preconditioner = None
-        if self.M is not None:
+        if self.M is not None and self.inverse is None:
             self.preconditioner = self.model(self.penalty_of_M(), 1.0, False)
         elif self.preconditioned:
             self.preconditioner = self.model(self.rho, self.tail, True)
@@ -210,9 +204,9 @@ cdef class SMALBE(MPRGP):
     def begin(self, x, mu, double rho):
         """Return ν near Π(x) − x̃ (n,), where Π projects onto the set, and the gradient.
 
-        The gradient includes Cᵀμ. The call takes one product, or no product for x = 0,
-        where 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν. Infinite components of x start at their bound,
-        or at x̃ if it is infinite. A start x ≠ 0 also moves towards Cν = 0 on its face.
+        The gradient includes Cᵀμ. The call takes one product, or none for x = 0, where
+        Hν = ρQν. Infinite components of x start at their bound, or at x̃ if it is
+        infinite. A start x ≠ 0 also moves towards Cν = 0 on its face.
         """
         cdef Py_ssize_t i, n = self.n
         cdef list owners = []
@@ -260,19 +254,16 @@ cdef class SMALBE(MPRGP):
         until the relative KKT residual of the QP is at most tol (`is_solved`).
 
         4. Apply safeguards. If two consecutive outer iterations did not halve ‖Cν‖,
-           then ρ ← 10ρ, but at most MAX_RHO. If ‖Cν‖ is small enough, but the gradient
-           is not, then M ← M/10 instead, so that an inner run finally meets the
-           tolerance or stagnates. CᵀCν is tested as a certificate of infeasibility.
+           then ρ ← 10ρ, but at most MAX_RHO, or M ← M/10 if ‖Cν‖ is already small
+           enough. CᵀCν is tested as a certificate of infeasibility.
 
         The return values are ν, g, μ, M, ρ, the outer iterations as tuples in the order
-        of `OuterIteration`, and the status, which is `Status.FAILED` if the iterates
-        diverged.
+        of `OuterIteration`, and the status (`Status.FAILED` for diverged iterates).
 
         at : an `Iterate`
         infeasible : ν → True if ν proves that there is no feasible point
         watch : function of k and the right-hand side that returns an observer of outer
-            iteration k, or None; the observer is called after each step with its
-            letter, x and g
+            iteration k, called after each step with its letter, x and g, or None
         aim : largest estimate of the relative KKT residual that ends the loop; 0 for tol
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
@@ -291,7 +282,7 @@ cdef class SMALBE(MPRGP):
         if not self.b_size:
             self.b_size = sqrt(dot(self.g, self.g, n))
         self.small_gradient = tol * self.b_size
-        self.coarse_gradient = options.eta * self.b_size
+        self.coarse_gradient = self.eta * self.b_size
         self.next_tested = INFINITY
         self.aim, self.least_gradient = aim or tol, self.small_gradient
         if aim:
@@ -364,9 +355,8 @@ cdef class SMALBE(MPRGP):
     cdef bint is_solved(self, double size) except -1:
         """Return True if the relative KKT residual is within tol.
 
-        The evaluation costs as much as several steps. It is therefore repeated only
-        when ‖g^P‖ (the argument `size`) has decreased enough, on the assumption that
-        the residual is proportional to ‖g^P‖.
+        The evaluation is repeated only when ‖g^P‖ (the argument `size`) has decreased
+        enough, on the assumption that the residual is proportional to it.
         """
         cdef double residual = self.residual()
         if residual <= self.aim or size <= self.least_gradient:
@@ -380,10 +370,9 @@ cdef class SMALBE(MPRGP):
     cdef double residual(self) noexcept:
         """Return the relative KKT residual, apart from the rows (stopping.pxi).
 
-        The multipliers of bounds, discs and rows remove all other components of the
-        gradient of the QP. Therefore r = ‖𝒫F𝒫‖g^P and the gap is xᵀr. With rows, the
-        component of Px along them is unknown. Until the scales are known, they then
-        consist of q alone, and the result is an upper bound.
+        With the multipliers of bounds, discs and rows, r = ‖𝒫F𝒫‖g^P and the gap is xᵀr.
+        With rows, the component of Px along them is unknown. Until the scales are known,
+        they then consist of q alone, and the result is an upper bound.
         """
         cdef Py_ssize_t i, n = self.n
         cdef double *w = self.tested.at
@@ -438,7 +427,7 @@ cdef class SMALBE(MPRGP):
         """Move ν towards Cν = 0 on the face with the mask `free`; v (n,) is workspace.
 
         Projections onto {Cν = 0} and onto the free components alternate (von Neumann)
-        as long as a pair reduces ‖Cν‖ by a fifth. Active bounds and discs remain active.
+        as long as a pair reduces ‖Cν‖ by a fifth.
         """
         cdef double error, before = INFINITY
         self.rows.times(nu, self.Cv)
@@ -457,13 +446,10 @@ cdef class SMALBE(MPRGP):
     def point(self, nu, mu, double rho, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
-        First, ν moves towards Cν = 0 on its face, because the outer loop ends with ‖Cν‖
-        of the order of the tolerance, which is the error of the force balance.
-
-        For a = ‖𝒫F𝒫‖(μ + ρCν) − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient
-        of the projected problem up to rounding and terms of the order of ‖Cν‖. On the
-        free components, where the residual must vanish, a least-squares correction of a
-        removes these errors.
+        First, ν moves towards Cν = 0 on its face. For a = ‖𝒫F𝒫‖(μ + ρCν) − C(Fx − d),
+        the residual Fx − d + Cᵀa equals the gradient of the projected problem up to
+        rounding and terms of the order of ‖Cν‖, which a least-squares correction of a on
+        the free components removes.
         """
         cdef Py_ssize_t i, j, k, n = self.n, r = self.rows.r
         cdef bint any_left = False

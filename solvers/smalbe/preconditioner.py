@@ -1,10 +1,10 @@
 """Preconditioners of the CG steps on a face of the box.
 
-The preconditioner `model` is inverted on each face (model.pxi), and `incomplete` is
-factorised on each face (incomplete.pxi). All other
-preconditioners use the same matrix M for all faces, restricted to the free components
-of the face: z = Mφ with the free gradient φ. For a dual with F = BK⁺Bᵀ, the structural
-preconditioners are
+The preconditioner `model` is inverted on each face (model.pxi), `incomplete` is
+factorised on each face (incomplete.pxi), and `sparse` approximates the inverse on each
+face (approximate.pxi). All other preconditioners use the same matrix M for all faces,
+restricted to the free components of the face: z = Mφ with the free gradient φ. For a
+dual with F = BK⁺Bᵀ, the structural preconditioners are
 
     lumped      M = B_D K_bb B_Dᵀ
     dirichlet   M = B_D S_bb B_Dᵀ,   S_bb = K_bb − K_bi K_ii⁻¹ K_ib
@@ -37,16 +37,21 @@ from scipy.sparse import csc_matrix, diags_array, issparse
 
 from mortarbench.harness import QP, Structure
 from mortarbench.harness.operators import Preconditioned, preconditioned
-from mortarbench.solvers.smalbe.compiled import IncompleteFactor, sparsity
+from mortarbench.solvers.smalbe.compiled import (
+    ApproximateInverse,
+    IncompleteFactor,
+    Product,
+    sparsity,
+)
 from mortarbench.solvers.smalbe.extension import Operator
 from mortarbench.solvers.smalbe.rows import Mask
 
 Preconditioner = Literal[
-    "auto", "model", "incomplete", "diagonal", "lumped", "dirichlet", "none"
+    "auto", "model", "sparse", "incomplete", "diagonal", "lumped", "dirichlet", "none"
 ]
 PRECONDITIONERS = get_args(Preconditioner)
 #: preconditioners with a matrix or operator M
-STRUCTURAL = ("diagonal", "lumped", "dirichlet")
+STRUCTURAL = ("sparse", "diagonal", "lumped", "dirichlet")
 #: entries that a CG step with an incomplete factor reads, in units of the entries of P:
 #: one product, and two substitutions with a triangle each
 STEP = 2
@@ -104,7 +109,7 @@ def resolved_preconditioner(
     if kind != "auto":
         return kind
     if isinstance(qp.P, np.ndarray):
-        return "model"
+        return "sparse"
     if preconditioned_operator(qp):
         return "dirichlet"
     P = P or sparsity_of(qp)
@@ -157,6 +162,8 @@ def missing_data(qp: QP, kind: Preconditioner) -> str | None:
             "preconditioner 'incomplete' needs a sparse P with a positive diagonal and "
             "few entries per row, and bounds only"
         )
+    if kind == "sparse" and not isinstance(qp.P, np.ndarray):
+        return "preconditioner 'sparse' needs a dense P"
     if kind == "diagonal" and qp.diagonal() is None:
         return "preconditioner 'diagonal' needs a P with a known diagonal"
     if (
@@ -168,8 +175,15 @@ def missing_data(qp: QP, kind: Preconditioner) -> str | None:
     return None
 
 
-def structural_preconditioner(qp: QP, kind: Preconditioner) -> Operator | None:
-    """Return M as a function; None unless `kind` is in `STRUCTURAL`."""
+def structural_preconditioner(
+    qp: QP, kind: Preconditioner, F: Product
+) -> Operator | ApproximateInverse | None:
+    """Return M for `kind` in `STRUCTURAL`, otherwise None.
+
+    F : the product with P
+    """
+    if kind == "sparse":
+        return ApproximateInverse(F)
     if kind not in STRUCTURAL:
         return None
     diagonal = qp.diagonal()

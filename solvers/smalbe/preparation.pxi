@@ -135,14 +135,12 @@ def lanczos(Product F, Rows C, start, int steps):
 
 
 # Largest ratio of the residual of the first Ritz pair to its value at which the pair
-# counts as converged. After twelve steps, the relative residual is at most 1e-12 on
-# duals of contact problems, and 1e-2 on a Laplacian. With 1 or 1e-14,
-# `test_compiled_steps_and_textbook_steps_are_the_same` fails.
+# counts as converged. After twelve steps, it is at most 1e-12 on duals of contact
+# problems, and 1e-2 on a Laplacian.
 cdef double RITZ_RESIDUAL = 1e-3
 
 
-# 𝒫F𝒫 counts as zero if its norm is at most this factor, which is several hundred times
-# 2⁻⁵³, times the mean eigenvalue of F.
+# 𝒫F𝒫 counts as zero if its norm is at most this factor times the mean eigenvalue of F.
 cdef double NORM_ROUNDING = 1e-13
 
 

@@ -1,6 +1,3 @@
-# Proportioning with an incomplete factor of the free block of P.
-
-
 cdef bint step_by_factor(MPRGP at) except -1:
     """Release components at bounds and step with the factor of the enlarged free set.
 
@@ -10,16 +7,13 @@ cdef bint step_by_factor(MPRGP at) except -1:
         s = Π(x − M⁻¹g_F) − x,    x ← x + αs
 
     where M ≈ P_FF is the incomplete factorisation and α minimises the cost along s
-    within the set. The step is a projected Newton step if M is exact. If no other
-    components were released, the boundary of a contact zone would move by only about
-    one component in a step, because −g points into the set only at adjacent components.
-    Therefore neighbours in the graph of P, up to a distance of `layers` edges, are also
-    released; a neighbour that the step would move out of the set stays at its bound. If
-    at least half of the neighbours leave their bounds, the number of layers is doubled,
-    otherwise halved, as it is after an expansion. With τ ≥ ‖H‖ and
-    p = Π(x − g/τ) − x, the step to x + p would decrease the cost by at least −gᵀp/2,
-    because gᵀp ≤ −τ‖p‖². A step that achieves less is replaced by a gradient projection
-    step, which costs one more product.
+    within the set: a projected Newton step if M is exact. Neighbours in the graph of P,
+    up to a distance of `layers` edges, are also released, because the boundary of a
+    contact zone would otherwise move by only about one component in a step. If at least
+    half of them leave their bounds, the number of layers is doubled, otherwise halved,
+    as it is after an expansion. With τ ≥ ‖H‖ and p = Π(x − g/τ) − x, the step to x + p
+    would decrease the cost by at least −gᵀp/2, because gᵀp ≤ −τ‖p‖². A step that
+    achieves less is replaced by a gradient projection step.
     """
     cdef Py_ssize_t i, count = 0, released, freed = 0, n = at.n
     cdef IncompleteFactor factor = at.factor

@@ -1,8 +1,7 @@
 /* Loops over vectors, and products with sparse matrices.
 
-   Each function is compiled for processors with AVX-512, for those with AVX2 and FMA,
-   and for all others; the loader selects the version. Conditions are written as conditional
-   expressions, so that the compiler can process several components at the same time. */
+   Each function is compiled for AVX-512, for AVX2 with FMA, and for all other processors.
+   Conditions are written as expressions, so that the compiler can vectorise them. */
 
 #include <math.h>
 #include <string.h>

@@ -160,7 +160,7 @@ def same_answers(qp, solver):
         assert getattr(fast, name) == pytest.approx(expected, abs=1e-5 * size)
 
 
-@pytest.mark.parametrize("preconditioner", ["model", "none", "diagonal"])
+@pytest.mark.parametrize("preconditioner", ["model", "sparse", "none", "diagonal"])
 @pytest.mark.parametrize("rows", ["sparse", "dense", "none"])
 @pytest.mark.parametrize("seed", range(2))
 def test_answers_with_all_rows_and_preconditioners_agree_with_the_textbook(

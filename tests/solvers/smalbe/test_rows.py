@@ -206,7 +206,7 @@ def test_a_motion_of_fixed_components_only_leaves_a_factor(monkeypatch, border, 
     assert np.abs(missed).max() <= 1e-6 * np.abs(t).max()
 
 
-@pytest.mark.parametrize("preconditioner", ["model", "none", "diagonal"])
+@pytest.mark.parametrize("preconditioner", ["model", "sparse", "none", "diagonal"])
 def test_the_same_steps_lead_to_the_same_point(G, e, monkeypatch, preconditioner):
     rng = np.random.default_rng(SEED)
     W = rng.normal(size=(40, 40))
