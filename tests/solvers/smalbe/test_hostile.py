@@ -50,7 +50,7 @@ def hostile(seed):
     )  # fmt: skip
 
 
-def ends(seeds):
+def ends(seeds, solver="smalbe"):
     """Return the numbers of runs without a solution and of all runs, and the false
     claims.
     """
@@ -58,7 +58,7 @@ def ends(seeds):
     for seed in seeds:
         qp = hostile(seed)
         for tol in TOLERANCES:
-            s = SOLVERS["smalbe"].prepare(qp, tol)()
+            s = SOLVERS[solver].prepare(qp, tol)()
             runs += 1
             if s.status is not Status.SOLVED:
                 given_up += s.status is Status.ITERATION_LIMIT

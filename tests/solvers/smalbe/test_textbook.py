@@ -352,7 +352,7 @@ def test_contact_forces_agree_with_those_of_the_textbook(case):
 @pytest.mark.slow
 def test_no_claim_about_a_hostile_qp_is_wrong():
     """The QPs have solutions; see `tests.solvers.smalbe.test_hostile`."""
-    _, runs, wrong = ends("smalbe-textbook", range(1000, 1015))
+    _, runs, wrong = ends(range(1000, 1015), "smalbe-textbook")
 
     assert runs == 45
     assert wrong == []
