@@ -25,9 +25,9 @@ cdef enum:
     MODEL = 0
     SPECTRAL = 1
     OWN = 2
-    # Number of previous costs with which the nonmonotone line search compares. A first
-    # Newton step is taken after as many steps, or after √n if this is larger.
+    # Number of previous costs with which the nonmonotone line search compares
     MEMORY = 20
+    FIRST_NEWTON = 100  # number of steps before the first Newton step, unless √n is larger
 
 
 # Fraction of the linear decrease that a spectral step must achieve (Armijo condition)

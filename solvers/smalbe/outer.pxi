@@ -91,7 +91,7 @@ cdef class SMALBE(MPRGP):
         if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept)
-        self.patience = <long>fmax(MEMORY, sqrt(self.n))
+        self.patience = <long>fmax(FIRST_NEWTON, sqrt(self.n))
         self.tangents = Directions(
             self.n, MAX_DIRECTIONS if self.expansion == SPECTRAL else 0
         )
