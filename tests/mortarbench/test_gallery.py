@@ -77,7 +77,7 @@ def test_notebooks_are_stored_without_outputs():
 @pytest.mark.slow
 def test_a_first_comparison(execute):
     """All answers are verified; at each tolerance, the errors on dual forms differ by a
-    factor of at least four, and all errors are below √tol.
+    factor of at least five, and all errors are below √tol.
     """
     (statuses, spread, worst), shown = execute(
         "first-comparison",
@@ -86,7 +86,7 @@ def test_a_first_comparison(execute):
         "max(errors[tol].max() / tol**0.5 for tol in errors)",
     )
     assert statuses == ["declined", "verified"]
-    assert spread > 4
+    assert spread > 5
     assert worst < 1
     assert shown["image/png"] == 2
 
@@ -166,7 +166,7 @@ def test_the_code_of_your_own_solver(run_code):
     plain, moves, df = found["rates"]["plain"], found["moves"], found["results"].df
 
     assert moves[-1] / moves[-2] == pytest.approx(plain, rel=1e-3)
-    assert set(df[df.status == "inaccurate"].solver) == {"plain"}
+    assert set(df[df.status == "inaccurate"].solver) == {"momentum", "plain"}
     assert set(found["checks"].grade) == {"decline", "pass"}
     assert found["done"].returncode == 0
     found["plt"].close("all")
