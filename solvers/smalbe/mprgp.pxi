@@ -296,9 +296,9 @@ cdef class MPRGP:
                 # Step 4. Proportioning, because releasing components promises a larger
                 # decrease than a step on the face.
                 last, chopped = chopped, self.parts.beta_square
-                letter = self.proportion(
-                    2 * chopped <= last or self.B.basis is None
-                )
+                # If the last step by the model did not halve ‖β‖², the next is along −β
+                # (`test_a_poor_model_is_replaced`).
+                letter = self.proportion(2 * chopped <= last or self.B.basis is None)
             elif not inside and self.spectral_step_leaves(begun):
                 letter = b"e" if self.step_spectrally() else 0
             else:

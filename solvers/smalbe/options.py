@@ -35,7 +35,8 @@ class Options:
     rho: float = 0.0
     M: float = 1.0  #: initial M in units of ‖𝒫F𝒫‖; inner runs end at ‖g^P‖ ≤ M‖Cν‖
     beta: float = 0.5  #: multiplies M if the Lagrangian grows too little
-    eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at the end of an inner run
+    #: largest ‖g^P‖/‖b‖ at the end of an inner run; CG for a Newton step ends at η²
+    eta: float = 0.1
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP: ‖β‖² > Γ²φ̃ᵀφ
     # if P is sparse, conjugation against stored directions costs more than a product
     recycle: bool = True  #: make CG directions conjugate to all stored ones
